@@ -57,6 +57,8 @@ def split_trajectories(signals: Signals, gap: float | None, report: ImportReport
     """Number the trajectories. A new trajectory begins if the trajectory number in the log changes, if the
     clock restarts, or after a step longer than `gap` [s], which is `GAP_STEPS` usual steps by default.
 
+    Rows out of order are sorted by time if the positions then move less.
+
     Raises:
         DataError: time runs backward without a restart. The message lists the rows.
     """
@@ -71,6 +73,9 @@ def split_trajectories(signals: Signals, gap: float | None, report: ImportReport
                 wrong.append(row)
             else:
                 start = row
+        if wrong and _sort(signals, report):
+            split_trajectories(signals, gap, report)
+            return
         if wrong:
             raise DataError(
                 f"time runs backward in {describe(numbered(signals.row[wrong]))}",
@@ -94,6 +99,27 @@ def split_trajectories(signals: Signals, gap: float | None, report: ImportReport
             text = f"time stamps come in bursts of about {rows:.2g} rows: the clock of a receiver or a buffer"
             report.find("bursts", f"{text}, not of the robot", signals.row[gaps])
     signals.segment = np.cumsum(new | back | gaps) - 1
+
+
+def _sort(signals: Signals, report: ImportReport) -> bool:
+    """Sort rows by time within each trajectory of the log, if positions then change less in total.
+
+    A clock that was set back would make them change more.
+    """
+    part = np.cumsum(np.append(False, np.diff(signals.segment) != 0))
+    order = np.lexsort((signals.t, part))
+    within = np.diff(part) == 0
+    before, after = (
+        np.abs(np.diff(q, axis=0))[within].sum() for q in (signals.vectors["q"], signals.vectors["q"][order])
+    )
+    if not after < before:
+        return False
+    # Those that a later row precedes
+    latest = np.concatenate([np.maximum.accumulate(signals.t[part == k]) for k in range(part[-1] + 1)])
+    late = signals.t < latest
+    report.find("order", f"{late.sum()} rows were out of order, and were sorted by time", signals.row[late])
+    signals.reorder(order)
+    return True
 
 
 def find_held(signals: Signals, drop: bool, report: ImportReport) -> None:

@@ -171,6 +171,12 @@ class Signals:
             self.vectors[name] = self.vectors.pop(name)[mask]
         self.contact = {name: value[mask] for name, value in self.contact.items()}
 
+    def reorder(self, order: NDArray[np.int64]) -> None:
+        """Put the rows into another order, given their present places (n,)."""
+        self.t, self.row, self.segment = self.t[order], self.row[order], self.segment[order]
+        self.vectors = {name: value[order] for name, value in self.vectors.items()}
+        self.contact = {name: value[order] for name, value in self.contact.items()}
+
     def runs(self, *keys: NDArray[np.generic]) -> list[slice]:
         """Return runs of rows, each within one segment, over which the additional keys are constant."""
         return runs(self.segment, *keys)
