@@ -380,8 +380,8 @@ IDENTIFIED = "identified inertia replaces that of the robot file, since it predi
 UNDETERMINED = 0.5
 """Standard deviation of a scale, over the stated one, from which on the torque is the nominal one."""
 FARTHEST = 3.0
-"""Stated standard deviations beyond which a scale stays nominal: the torque of the links is too small to show it
-then. Without this bound, one of 104 simulated torques from currents becomes ten times as large as it is."""
+"""Stated standard deviations beyond which a scale stays nominal, as the torque of the links is too small to
+show it. Without this bound, one of 104 simulated torques from currents becomes ten times as large."""
 ROUNDS = 3
 """Maximum number of estimates of the scales, each with the links of the previous one."""
 GAIN = 0.02

@@ -10,6 +10,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import scipy
@@ -27,7 +28,7 @@ from forcegp.errors import (
 )
 from forcegp.robot.model import BASE, RobotModel
 from forcegp.robot.safety import parse_xml, read_bytes
-from forcegp.robot.tree import Inertial, Joint, Tree, checked, joint_motion, lock_joints
+from forcegp.robot.tree import Base, Inertial, Joint, Tree, checked, joint_motion, lock_joints
 from forcegp.robot.urdf import read_urdf
 
 FRICTION_VELOCITY = 0.1
@@ -121,7 +122,7 @@ def _held_base(tree: Tree, placed: _Placed) -> list[str]:
         return []
     return [
         f"{tree.label}: no joint connects the base {root!r} ({mass:.3g} kg, with {len(limbs)} limbs) to the "
-        "world, so it is fixed; a walking robot needs a floating base, which is not supported"
+        'world, so it is fixed; a walking robot needs a floating base (base = "free")'
     ]
 
 
@@ -289,6 +290,7 @@ BUNDLED = ("double_pendulum", "franka_panda", "kuka_iiwa", "kuka_iiwa14", "ur5")
 def load_robot(
     source: str | Path,
     *,
+    base: Base = "fixed",
     base_position: Sequence[float | int] = (0.0, 0.0, 0.0),
     base_rpy: Sequence[float | int] = (0.0, 0.0, 0.0),
     gravity: Sequence[float | int] | None = None,
@@ -304,6 +306,9 @@ def load_robot(
     Args:
         source: `"kuka_iiwa"`, `"kuka_iiwa14"`, `"franka_panda"`, `"ur5"`, `"double_pendulum"`, or a file
             path.
+        base: `"fixed"`, or `"free"` for a robot whose base moves. Its pose is given by six joints, `base_x`,
+            `base_y`, `base_z`, `base_yaw`, `base_pitch` and `base_roll` (rotations about z, y, x), which
+            replace a floating joint. They are singular at a pitch of ±90°.
         base_position: position of the root link in the world [m].
         base_rpy: roll, pitch and yaw of the root link about the world axes [rad].
         gravity: gravitational acceleration in the world [m/s²]. The default is that of an MJCF file, and
@@ -324,7 +329,7 @@ def load_robot(
         (7, 'lbr_iiwa_joint_1')
 
     Raises:
-        UnknownNameError: the bundled robot, or a joint to lock or to couple, does not exist.
+        UnknownNameError: the robot, the kind of base, or a joint to lock or to couple does not exist.
         ParameterError: the coupling is singular or not finite.
         RobotFileError: the file cannot be read or is invalid. The message names the link or joint.
         UnsupportedRobotError: a joint is a floating, planar, ball or mimic joint. The hint is to lock it.
@@ -336,8 +341,9 @@ def load_robot(
     turn = scipy.spatial.transform.Rotation.from_euler("xyz", _vector(base_rpy, "base_rpy"))
     world = {"base_rotation": turn.as_matrix(), "base_position": _vector(base_position, "base_position")}
     world["gravity"] = _vector(GRAVITY if gravity is None else gravity, "gravity")
+    check_name("base", base, get_args(Base))
     path = robot_path(source)
-    tree = checked(lock_joints(read_tree(read_bytes(path), path), locked_joints or {}))
+    tree = checked(lock_joints(read_tree(read_bytes(path), path, base), locked_joints or {}))
     if gravity is None and tree.gravity is not None:
         world["gravity"] = np.array(tree.gravity)
         if abs(np.linalg.norm(tree.gravity) - np.linalg.norm(GRAVITY)) > UNUSUAL:
@@ -390,15 +396,15 @@ def robot_path(source: str | Path) -> Path:
     return path
 
 
-def read_tree(data: bytes, path: Path) -> Tree:
+def read_tree(data: bytes, path: Path, base: Base = "fixed") -> Tree:
     """Return the links and joints in the content of a file; raise `RobotFileError` if it is invalid."""
     root = parse_xml(data, str(path))
     if root.tag == "robot":
-        return read_urdf(root, str(path))
+        return read_urdf(root, str(path), base)
     if root.tag == "mujoco":
         from forcegp.robot.mjcf import read_mjcf  # loads MuJoCo, which is optional
 
-        return read_mjcf(root, path)
+        return read_mjcf(root, path, base)
     expected = "a <robot> or a <mujoco> document"
     raise RobotFileError(f"{path}: neither URDF nor MJCF", expected=expected, got=f"<{root.tag[:60]}>")
 

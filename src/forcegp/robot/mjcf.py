@@ -23,6 +23,7 @@ from scipy.spatial.transform import Rotation
 from forcegp.errors import InertiaError, RobotFileError, UnsupportedRobotError, optional_module
 from forcegp.robot.mjcf_reduce import reduce_mjcf, unsupported_equality
 from forcegp.robot.tree import (
+    Base,
     Coupling,
     Drive,
     Inertial,
@@ -42,13 +43,13 @@ _KINDS: dict[int, JointKind] = {
 }
 
 
-def read_mjcf(root: Element, path: Path) -> Tree:
+def read_mjcf(root: Element, path: Path, base: Base = "fixed") -> Tree:
     """Return the links and joints of a `<mujoco>` document.
 
     Bodies become links, and bodies and sites become frames. Multiple joints of a body are separated by
     massless links. Typed errors quote MuJoCo's compiler, or name unsupported or unphysical elements.
     """
-    document, remarks = reduce_mjcf(root, path)
+    document, remarks = reduce_mjcf(root, path, base)
     with _warnings_of_mujoco(str(path), remarks):
         model, gains = _compile(document, path)
         remarks += [f"{path}: {text} off by a flag" for text in _switched_off(model)]

@@ -11,7 +11,9 @@ from pathlib import Path
 from xml.etree.ElementTree import Element, SubElement
 
 from forcegp.errors import InertiaError, RobotFileError, UnsupportedRobotError
+from forcegp.robot.free_base import free_mjcf
 from forcegp.robot.safety import MAX_ELEMENTS, MAX_NUMBER, parse_xml, read_bytes
+from forcegp.robot.tree import Base
 
 _IGNORED_SECTIONS = ("size", "statistic", "visual", "asset", "contact", "sensor", "keyframe", "custom")
 _KEPT_SECTIONS = ("default", "actuator", "tendon", "equality")
@@ -38,11 +40,13 @@ _WORDS = (
 """Attributes that are names and not numbers."""
 
 
-def reduce_mjcf(root: Element, path: Path) -> tuple[Element, list[str]]:
+def reduce_mjcf(root: Element, path: Path, base: Base = "fixed") -> tuple[Element, list[str]]:
     """Return the reduced document, with files included from its folder, and notes. Raise typed errors that
     name invalid or unsupported elements.
     """
     _expand_includes(root, path)
+    if base == "free":
+        free_mjcf(root, str(path))
     document = Element("mujoco", model=root.get("model", path.stem))
     remarks: list[str] = []
     for section in root:

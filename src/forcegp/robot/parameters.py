@@ -128,7 +128,11 @@ class AnalyticalParameters(nn.Module):
 
 def _joints(robot: RobotModel, quantity: str, names: Sequence[str] | Literal["all"]) -> tuple[str, ...]:
     check_name("quantity to learn", quantity, QUANTITIES)
-    chosen = robot.joint_names if names == "all" else tuple(names)
+    chosen = tuple(names) if names != "all" else robot.joint_names
+    if names == "all" and quantity in ("mass", "inertia"):
+        # Links between the joints of a body, such as a free base, have neither.
+        empty = (robot.mass == 0.0) & (robot.inertia == 0.0).flatten(1).all(-1)
+        chosen = tuple(name for name, none in zip(chosen, empty.tolist(), strict=True) if not none)
     for name in chosen:
         robot.joint_index(name)
     return tuple(dict.fromkeys(chosen))

@@ -14,6 +14,7 @@ import scipy
 from forcegp.errors import InertiaError, RobotFileError, UnsupportedRobotError, check_name, did_you_mean
 
 JointKind = Literal["revolute", "prismatic", "fixed"]
+Base = Literal["fixed", "free"]
 
 
 @dataclass(frozen=True)

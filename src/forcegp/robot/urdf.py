@@ -9,8 +9,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from forcegp.errors import InertiaError, RobotFileError, UnsupportedRobotError
+from forcegp.robot.free_base import WORLD, with_free_base
 from forcegp.robot.safety import parse_numbers, xacro_error
-from forcegp.robot.tree import Coupling, Inertial, Joint, Link, Tree, transform
+from forcegp.robot.tree import Base, Coupling, Inertial, Joint, Link, Tree, transform
 
 _NUMBERS = {
     "origin": {"xyz": 3, "rpy": 3},
@@ -35,12 +36,13 @@ _INSTEAD = {
 }
 """Remedies for unsupported joint types."""
 _KINDS = ("revolute", "continuous", "prismatic", "fixed")
-WORLD = "world"
-"""Name of the fixed world, which some files use as a link without declaring it as such."""
 
 
-def read_urdf(root: Element, label: str) -> Tree:
+def read_urdf(root: Element, label: str, base: Base = "fixed") -> Tree:
     """Return the links and joints of a `<robot>` element. Errors name invalid or unsupported elements."""
+    floating = [e for e in root.findall("joint") if e.get("type") == "floating"] if base == "free" else []
+    for element in floating:
+        element.set("type", "fixed")
     for element in root.iter():
         macros = [text for text in element.attrib.values() if "${" in text or "$(" in text]
         if macros or "xacro" in element.tag:
@@ -48,12 +50,16 @@ def read_urdf(root: Element, label: str) -> Tree:
     links = tuple(_link(element, label) for element in root.findall("link"))
     joints = tuple(_joint(element, label) for element in root.findall("joint"))
     remarks: tuple[str, ...] = ()
-    # As in Drake, a fixed joint may attach the robot to a `world` that is not a link in the file.
+    # Some files use the world as a link without declaring it. As in Drake, a fixed joint may attach the robot
+    # to it.
     attached = any(joint.parent == WORLD and joint.kind == "fixed" for joint in joints)
     if attached and all(link.name != WORLD for link in links):
         links = (Link(WORLD), *links)
         remarks = (f"{label}: link {WORLD!r} is used but not declared; it is taken as the base",)
-    return Tree(root.get("name") or "robot", label, links, joints, remarks=remarks)
+    tree = Tree(root.get("name") or "robot", label, links, joints, remarks=remarks)
+    if base == "fixed" or not links:
+        return tree
+    return with_free_base(tree, *(_name(element, label) for element in floating[:1]))
 
 
 def _name(element: Element, label: str) -> str:

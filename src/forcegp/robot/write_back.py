@@ -21,11 +21,21 @@ from torch import Tensor
 from forcegp.errors import RobotFileError
 from forcegp.files import atomic_file
 from forcegp.robot.edit_xml import EditableXml, Span
+from forcegp.robot.free_base import BASE_JOINTS
 from forcegp.robot.inertia import from_pseudo_inertia, pseudo_inertia
 from forcegp.robot.load import read_tree, robot_of, robot_path
 from forcegp.robot.model import RobotModel
 from forcegp.robot.safety import parse_xml, read_bytes
-from forcegp.robot.tree import Inertial, Tree, checked, inertia_doubt, inertia_error, lock_joints, transform
+from forcegp.robot.tree import (
+    Base,
+    Inertial,
+    Tree,
+    checked,
+    inertia_doubt,
+    inertia_error,
+    lock_joints,
+    transform,
+)
 
 CHANGED = 1e-6
 """Relative change in a parameter below which the text in the file is preserved."""
@@ -93,7 +103,8 @@ def write_robot(
     """
     path, robot = robot_path(source), robot.to("cpu", torch.float64)
     data, locked = read_bytes(path), locked_joints or {}
-    content = read_tree(data, path)
+    base: Base = "free" if robot.joint_names[: len(BASE_JOINTS)] == BASE_JOINTS else "fixed"
+    content = read_tree(data, path, base)
     tree = checked(lock_joints(content, locked))
     file = robot_of(tree, _world(robot))
     if file.joint_names != robot.joint_names:
@@ -111,7 +122,9 @@ def write_robot(
     changes += scaled
     written = document.written()
     losses = (*_losses(robot, writer.figures), *unscaled)
-    _check(robot, robot_of(checked(lock_joints(read_tree(written, path), locked)), _world(robot)), writer)
+    _check(
+        robot, robot_of(checked(lock_joints(read_tree(written, path, base), locked)), _world(robot)), writer
+    )
     with atomic_file(out) as temporary:
         temporary.write_bytes(written)
     return WrittenRobot(tuple(changes), losses)
@@ -336,10 +349,12 @@ class _Mjcf:
         worlds = [section for section in document.root.children if section.tag == "worldbody"]
         bodies = [e for world in worlds for e in world.iter() if e.tag == "body"]
         joints = [part for body in bodies for part in _inside(body) if part.tag == "joint"]
+        joints = [part for part in joints if part.attributes.get("type") != "free"]
         # The compiled model has the order of the document, and the world as its first link.
         links = [link.name for link in content.links if link.frame][1:]
         self._bodies = _named(bodies, links)
-        self._joints = _named(joints, [joint.name for joint in content.joints if joint.kind != "fixed"])
+        names = [joint.name for joint in content.joints if joint.kind != "fixed"]
+        self._joints = _named(joints, [name for name in names if name not in BASE_JOINTS])
         sections = [section for section in document.root.children if section.tag == "actuator"]
         self._actuators = [e for section in sections for e in section.children]
         self._drives = [drive for drive in content.drives if drive.gains]

@@ -99,6 +99,7 @@ class RobotSection(Section):
     """`[robot]`: arguments of `forcegp.load_robot`. A path is relative to the folder of the scene file."""
 
     model: str
+    base: Base = "fixed"
     base_position: Point = (0.0, 0.0, 0.0)
     base_rpy: Point = (0.0, 0.0, 0.0)
     gravity: Point | None = None

@@ -1,0 +1,95 @@
+"""A floating base as six joints: three slides along the world axes, then rotations about z, y and x.
+
+The pose of the base in the world is p = (x, y, z) and R = R_z(yaw) R_y(pitch) R_x(roll), so all parts of the
+library see ordinary joints. Angles are singular at a pitch of ±90°, where M is singular too. The joints have
+no motor, no friction and no limits.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from xml.etree.ElementTree import Element
+
+import numpy as np
+
+from forcegp.errors import RobotFileError
+from forcegp.robot.tree import Joint, JointKind, Link, Tree
+
+KINDS: dict[str, JointKind] = {
+    "base_x": "prismatic",
+    "base_y": "prismatic",
+    "base_z": "prismatic",
+    "base_yaw": "revolute",
+    "base_pitch": "revolute",
+    "base_roll": "revolute",
+}
+BASE_JOINTS = tuple(KINDS)
+"""Names of the joints, in order."""
+_AXES = ("1 0 0", "0 1 0", "0 0 1", "0 0 1", "0 1 0", "1 0 0")
+WORLD = "world"
+"""Name of the fixed world."""
+_POSE = ("pos", "quat", "axisangle", "euler", "xyaxes", "zaxis")
+
+
+def with_free_base(tree: Tree, floating: str | None = None) -> Tree:
+    """Return the tree with six joints between the world and the root link, or the child of a floating joint.
+
+    Args:
+        tree: links and joints, in which a floating joint counts as a fixed one.
+        floating: name of this joint, if there is one.
+
+    Raises:
+        RobotFileError: a joint has the name of one of the six.
+    """
+    for joint in tree.joints:
+        if joint.name in KINDS:
+            text = f"{tree.label}: joint {joint.name!r} has the name of a joint of the free base"
+            raise RobotFileError(text, expected=f"other names than {', '.join(BASE_JOINTS)}")
+    children = {joint.child for joint in tree.joints}
+    (root, *_) = [link.name for link in tree.links if link.name not in children] or [tree.links[0].name]
+    of_world = [joint for joint in tree.joints if joint.name == floating or joint.parent == root == WORLD]
+    replaced = of_world[:1] if floating is not None or len(of_world) == 1 else []
+    body = replaced[0].child if replaced else root
+    ground = replaced[0].parent if replaced else WORLD
+    links = tree.links if replaced or root == ground else (Link(ground), *tree.links)
+    parents = (ground, *(f"{ground}/{name}" for name in BASE_JOINTS[:-1]))
+    ends = zip(BASE_JOINTS, parents, (*parents[1:], body), _AXES, strict=True)
+    joints = (
+        Joint(name, KINDS[name], parent, child, np.eye(4), axis=np.array(axis.split(), dtype=float))
+        for name, parent, child, axis in ends
+    )
+    others = (joint for joint in tree.joints if joint not in replaced)
+    links = (*links, *(Link(name, frame=False) for name in parents[1:]))
+    return replace(tree, links=links, joints=(*joints, *others))
+
+
+def free_mjcf(root: Element, label: str) -> None:
+    """Replace the free joint of an MJCF document by six joints, or add them to its only body in the world.
+
+    Raises:
+        RobotFileError: several bodies could be the base.
+    """
+    worlds = root.findall("worldbody")
+    bodies = [body for world in worlds for body in world.findall("body")]
+    free = [body for body in bodies if _free_joints(body)]
+    moving = free or [body for body in bodies if next(body.iter("joint"), None) is not None]
+    if len(moving) != 1:
+        raise RobotFileError(
+            f"{label}: the base of the robot is not clear",
+            expected="one body in <worldbody> with a free joint, or one with joints",
+            got=", ".join(repr(body.get("name", "(unnamed)")) for body in moving) or "no such body",
+        )
+    (body,) = moving
+    for joint in _free_joints(body):
+        body.remove(joint)
+    for name in _POSE:
+        body.attrib.pop(name, None)
+    for k, (name, kind) in enumerate(KINDS.items()):
+        slide = "slide" if kind == "prismatic" else "hinge"
+        values = {"name": name, "type": slide, "axis": _AXES[k], "pos": "0 0 0", "limited": "false"}
+        plain = {"damping": "0", "frictionloss": "0", "armature": "0", "stiffness": "0", "ref": "0"}
+        body.insert(k, Element("joint", {**values, **plain}))
+
+
+def _free_joints(body: Element) -> list[Element]:
+    return [x for x in body if x.tag == "freejoint" or (x.tag == "joint" and x.get("type") == "free")]

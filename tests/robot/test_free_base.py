@@ -1,0 +1,199 @@
+"""A free base as six joints gives the figures of Pinocchio's free-flyer and of MuJoCo's free joint."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from scipy.integrate import solve_ivp
+from torch import Tensor
+
+import forcegp
+from forcegp import dynamics, kinematics
+from forcegp.errors import RobotFileError, UnknownNameError
+from forcegp.robot.free_base import BASE_JOINTS
+from forcegp.robot.write_back import write_robot
+from pinocchio_oracle import pin
+from robots import ARMS, Arm, example_data, kinetic_energy, potential_energy, random_states
+
+LEGGED = [
+    arm for arm in ARMS if arm.name in ("solo12", "go2", "anymal_kinova", "bolt", "g1", "talos", "icub")
+]
+RELATIVE = 1e-10
+mujoco = pytest.importorskip("mujoco")
+HOPPER = """<mujoco><default><joint damping="0.3" armature="0.01"/></default><worldbody>
+<geom type="plane" size="1 1 .1"/>
+<body name="trunk" pos="0 0 1" euler="20 0 30"><freejoint name="root"/>
+<inertial pos=".02 0 .01" mass="3" fullinertia=".05 .06 .04 .002 .001 .003"/>
+<body name="thigh" pos=".1 0 0"><joint name="hip" axis="0 1 0"/>
+<inertial pos="0 0 -.1" mass=".5" diaginertia=".002 .002 .0005"/>
+<body name="shank" pos="0 0 -.2"><joint name="knee" axis="0 1 0"/>
+<inertial pos="0 0 -.1" mass=".3" diaginertia=".001 .001 .0002"/><site name="foot" pos="0 0 -.2"/>
+</body></body></body></worldbody></mujoco>"""
+
+
+def turn(q: Tensor) -> Tensor:
+    """R_z(yaw) R_y(pitch) R_x(roll)."""
+    rotations = []
+    for angle, (i, j) in zip(q[3:6], ((0, 1), (2, 0), (1, 2)), strict=True):
+        generator = torch.zeros(3, 3, dtype=q.dtype)
+        generator[i, j], generator[j, i] = -1.0, 1.0
+        rotations.append(torch.linalg.matrix_exp(angle * generator))
+    return rotations[0] @ rotations[1] @ rotations[2]
+
+
+def body_velocity(q: Tensor, qd: Tensor) -> Tensor:
+    """Velocities of a free-flyer in its own axes, linear before angular, and of the joints."""
+    R, rate = torch.func.jvp(turn, (q,), (qd,))
+    spin = R.mT @ rate
+    return torch.cat([R.mT @ qd[:3], torch.stack([spin[2, 1], spin[0, 2], spin[1, 0]]), qd[6:]])
+
+
+class FreeFlyer:
+    """Pinocchio's model with a free-flyer, with vectors in our joint order."""
+
+    def __init__(self, arm: Arm, robot: forcegp.RobotModel) -> None:
+        if pin is None:
+            pytest.skip("Pinocchio is not installed")
+        self.model = pin.buildModelFromUrdf(str(arm.path), pin.JointModelFreeFlyer())
+        self.model.armature = np.zeros(self.model.nv)
+        self.model.gravity.linear = robot.gravity.numpy()
+        self.data = self.model.createData()
+        self.joints = [self.model.joints[self.model.getJointId(name)] for name in robot.joint_names[6:]]
+        self.order = [*range(6), *(joint.idx_v for joint in self.joints)]
+
+    def vector(self, x: Tensor) -> np.ndarray:
+        """A velocity in Pinocchio's order."""
+        out = np.zeros(self.model.nv)
+        out[self.order] = x.numpy()
+        return out
+
+    def position(self, q: Tensor) -> np.ndarray:
+        """A configuration."""
+        out = pin.neutral(self.model)
+        out[:7] = pin.SE3ToXYZQUAT(pin.SE3(turn(q).numpy(), q[:3].numpy()))
+        for joint, value in zip(self.joints, q[6:].tolist(), strict=True):
+            entry = [value] if joint.nq == 1 else [np.cos(value), np.sin(value)]
+            out[joint.idx_q : joint.idx_q + joint.nq] = entry
+        return out
+
+
+def states(robot: forcegp.RobotModel, count: int = 3) -> tuple[Tensor, ...]:
+    """Random states with a pitch within ±1."""
+    q, *rest = random_states(robot, count)
+    q[:, 4] /= np.pi
+    return q, *rest
+
+
+def relative(ours: Tensor, theirs: np.ndarray) -> float:
+    return float(np.abs(ours.numpy() - theirs).max() / np.abs(theirs).max())
+
+
+@pytest.mark.parametrize("arm", LEGGED, ids=lambda arm: arm.name)
+def test_dynamics_of_the_free_flyer(arm: Arm) -> None:
+    robot = arm.load(base="free")
+    assert robot.joint_names[:6] == BASE_JOINTS
+    oracle = FreeFlyer(arm, robot)
+    q, qd, qdd, _ = states(robot)
+    M, force = dynamics.mass_matrix(robot, q), dynamics.inverse_dynamics(robot, q, qd, qdd)
+    back = dynamics.forward_dynamics(robot, q, qd, force)
+    frame = robot.frame_names[-1]
+    J = kinematics.frame_jacobian(robot, q, frame)
+    for k in range(len(q)):
+        T = torch.func.jacrev(lambda x, k=k: body_velocity(q[k], x))(qd[k])
+        v = body_velocity(q[k], qd[k])
+        a = torch.func.jvp(body_velocity, (q[k], qd[k]), (qd[k], qdd[k]))[1]
+        place, at = oracle.position(q[k]), np.ix_(oracle.order, oracle.order)
+        upper = np.triu(pin.crba(oracle.model, oracle.data, place))
+        theirs = (upper + np.triu(upper, 1).T)[at]
+        assert relative(M[k], T.mT.numpy() @ theirs @ T.numpy()) < RELATIVE
+        torque = pin.rnea(oracle.model, oracle.data, place, oracle.vector(v), oracle.vector(a))[oracle.order]
+        assert relative(force[k], T.mT.numpy() @ torque) < RELATIVE
+        rounding = 8.0 * np.finfo(float).eps * np.linalg.cond(M[k].numpy())
+        assert relative(back[k], qdd[k].numpy()) < max(RELATIVE, rounding)
+        where = oracle.model.getFrameId(frame)
+        world = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+        both = pin.computeFrameJacobian(oracle.model, oracle.data, place, where, world)[:, oracle.order]
+        assert relative(J[k], np.roll(both, 3, axis=0) @ T.numpy()) < RELATIVE
+
+
+def test_momentum_and_energy_in_flight() -> None:
+    robot = next(arm for arm in LEGGED if arm.name == "solo12").load(base="free")
+    robot = robot.replace(damping=0.0 * robot.damping, friction=0.0 * robot.friction)
+    q, qd, *_ = states(robot, 1)
+    n, duration = robot.nq, 0.2
+
+    def rate(t: float, x: np.ndarray) -> np.ndarray:
+        at = torch.from_numpy(x.copy())
+        qdd = dynamics.forward_dynamics(robot, at[:n], at[n:], torch.zeros(n, dtype=at.dtype))
+        return np.concatenate([x[n:], qdd.numpy()])
+
+    x = torch.cat([q[0], qd[0]])
+    end = torch.from_numpy(solve_ivp(rate, (0.0, duration), x.numpy(), rtol=1e-9, atol=1e-9).y[:, -1].copy())
+    (q0, v0), (q1, v1) = x.split(n), end.split(n)
+    energy = [kinetic_energy(robot, a, b) + potential_energy(robot, a) for a, b in ((q0, v0), (q1, v1))]
+    torch.testing.assert_close(energy[1], energy[0], rtol=1e-6, atol=1e-6)
+    # The first three rows of M q̇ are the linear momentum.
+    p0, p1 = ((dynamics.mass_matrix(robot, a) @ b)[:3] for a, b in ((q0, v0), (q1, v1)))
+    weight = float(robot.mass.sum()) * robot.gravity
+    torch.testing.assert_close(p1 - p0, duration * weight, rtol=1e-6, atol=1e-6)
+
+
+def test_a_free_joint_of_mjcf_is_that_of_mujoco(tmp_path: Path) -> None:
+    path = tmp_path / "hopper.xml"
+    path.write_text(HOPPER)
+    robot = forcegp.load_robot(path, base="free")
+    assert robot.joint_names == (*BASE_JOINTS, "hip", "knee")
+    assert robot.damping.tolist() == [0.0] * 6 + [0.3] * 2
+    assert robot.armature.tolist() == [0.0] * 6 + [0.01] * 2
+    model = mujoco.MjModel.from_xml_string(HOPPER)
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
+    data = mujoco.MjData(model)
+    q, qd, qdd, _ = states(robot)
+    site = model.site("foot").id
+    for k in range(len(q)):
+        v, a = torch.func.jvp(body_velocity, (q[k], qd[k]), (qd[k], qdd[k]))
+        R = turn(q[k])
+        quaternion = np.zeros(4)
+        mujoco.mju_mat2Quat(quaternion, R.numpy().flatten())
+        data.qpos[:] = [*q[k, :3], *quaternion, *q[k, 6:]]
+        data.qvel[:] = [*qd[k, :3], *v[3:]]
+        data.qacc[:] = [*qdd[k, :3], *a[3:]]
+        mujoco.mj_inverse(model, data)
+        T = torch.func.jacrev(lambda x, k=k: body_velocity(q[k], x))(qd[k])
+        T[:3] = torch.eye(3, robot.nq)
+        rigid = dynamics.inverse_dynamics(robot, q[k], qd[k], qdd[k]) + robot.damping * qd[k]
+        assert relative(rigid, T.mT.numpy() @ data.qfrc_inverse) < RELATIVE
+        _, position = kinematics.frame_pose(robot, q[k], "foot")
+        assert np.abs(position.numpy() - data.site_xpos[site]).max() < RELATIVE
+    written = write_robot(robot.replace(mass=1.1 * robot.mass), path, tmp_path / "out.xml")
+    assert any(change.element == "trunk" and change.figure == "mass" for change in written.changes)
+    assert "<freejoint" in (tmp_path / "out.xml").read_text()
+
+
+def test_a_floating_joint_of_urdf_is_replaced(tmp_path: Path) -> None:
+    text = (example_data() / "solo_description/robots/solo12.urdf").read_text()
+    ends = '<parent link="odom"/><child link="base_link"/>'
+    root = f'<link name="odom"/><joint name="float" type="floating">{ends}</joint>'
+    path = tmp_path / "solo.urdf"
+    path.write_text(text.replace("</robot>", f"{root}</robot>"))
+    robot, plain = (forcegp.load_robot(source, base="free") for source in (path, LEGGED[0].path))
+    assert robot.joint_names == plain.joint_names
+    q = states(robot, 1)[0][0]
+    torch.testing.assert_close(dynamics.mass_matrix(robot, q), dynamics.mass_matrix(plain, q))
+
+
+def test_unclear_bases_are_named(tmp_path: Path) -> None:
+    with pytest.raises(UnknownNameError, match="base"):
+        forcegp.load_robot("ur5", base="floating")  # pyright: ignore[reportArgumentType]
+    path = tmp_path / "two.xml"
+    body = '<body><freejoint/><inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/></body>'
+    path.write_text(f"<mujoco><worldbody>{body}{body}</worldbody></mujoco>")
+    with pytest.raises(RobotFileError, match="base of the robot is not clear"):
+        forcegp.load_robot(path, base="free")
+    text = LEGGED[0].path.read_text().replace("FL_HAA", "base_x")
+    (tmp_path / "named.urdf").write_text(text)
+    with pytest.raises(RobotFileError, match="'base_x' has the name of a joint of the free base"):
+        forcegp.load_robot(tmp_path / "named.urdf", base="free")
