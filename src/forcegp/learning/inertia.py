@@ -142,16 +142,15 @@ def rescaled_robot(robot: RobotModel, rows: Rows, std: float) -> Inertia:
         rows: samples in free motion with nominal torques.
         std: stated standard deviation of s.
     """
-    found, known = Inertia(robot), rows
-    for _ in range(ROUNDS):
-        scale, spread = torque_scale(robot, known, std)
-        found = rigid_robot(robot, rows.scaled(scale))
-        if IDENTIFIED not in found.doubts:
-            break
+    scale, spread = torque_scale(robot, rows, std)
+    found = rigid_robot(robot, rows.scaled(scale))
+    for _ in range(ROUNDS if IDENTIFIED in found.doubts else 0):
         # Y π for the changed links
         before, after = (inertial_parameters(x.mass, x.com, x.inertia) for x in (robot, found.robot))
         change = (links_at(robot, rows) @ (after - before).flatten()[:, None])[..., 0]
         known = dataclasses.replace(rows, residual=rows.residual - change)
+        scale, spread = torque_scale(robot, known, std)
+        found = rigid_robot(robot, rows.scaled(scale))
     robot = found.robot.replace(torque_scale=scale)
     return dataclasses.replace(found, robot=robot, spread=tuple(spread.tolist()))
 
@@ -382,8 +381,8 @@ UNDETERMINED = 0.5
 FARTHEST = 3.0
 """Stated standard deviations beyond which a scale stays nominal, as the torque of the links is too small to
 show it. Without this bound, one of 104 simulated torques from currents becomes ten times as large."""
-ROUNDS = 3
-"""Maximum number of estimates of the scales, each with the links of the previous one."""
+ROUNDS = 2
+"""Number of further estimates of the scales for identified links, each with those of the previous one."""
 GAIN = 0.02
 """Relative standard deviation of the gain of a torque sensor, up to 2 % in data sheets of strain gauges."""
 CLEAR = 3.0

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from forcegp.identification import regressor
 from forcegp.logs.mapping import Mapping
@@ -25,7 +26,7 @@ ROWS, RISE, RIDGE, CHANGES, FEWEST = 3000, 0.02, 1e-4, 0.5, 100
 penalty, least share of rows in which a torque must change, and fewest rows."""
 
 
-def without_noise(signals: Signals, mapping: Mapping) -> Array:
+def without_noise(signals: Signals, mapping: Mapping) -> NDArray[np.bool_]:
     """Return a mask `(nq,)` of the measured torques that change without noise, before any filter."""
     tau = signals.vectors["tau"]
     steps = [np.diff(tau[run], axis=0) for run in signals.runs() if run.stop - run.start > 6]
@@ -39,7 +40,9 @@ def without_noise(signals: Signals, mapping: Mapping) -> Array:
     return measured & changes & (noise < NOISE * np.sqrt(np.mean(tau**2, axis=0)))
 
 
-def find_modelled(signals: Signals, smooth: Array, robot: RobotModel, report: ImportReport) -> None:
+def find_modelled(
+    signals: Signals, smooth: NDArray[np.bool_], robot: RobotModel, report: ImportReport
+) -> None:
     """Report torques without noise that no joint friction changes, if most torques are of this kind."""
     n = len(signals)
     if 2 * smooth.sum() <= len(smooth) or n < FEWEST:

@@ -595,10 +595,11 @@ def _figures(robot: RobotModel) -> Tensor:
 
 def _torque_scales(fit: StructuredFit, robot: RobotModel) -> Iterator[Parameter]:
     """Yield the scales of the torques, if they are unknown."""
-    for p in fit.parameters() if robot.torque_scale is not None else ():
-        if SCALE in p.name:
+    scale = robot.torque_scale
+    for p in () if scale is None else fit.parameters():
+        if scale is not None and SCALE in p.name:
             joint = p.name.split(SCALE)[1]
-            value = float(robot.torque_scale[robot.joint_names.index(joint)])
+            value = float(scale[robot.joint_names.index(joint)])
             yield Parameter(joint, "torque_scale", 1.0, value, p.std, p.determined)
 
 

@@ -13,6 +13,7 @@ from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, Pos
 from forcegp.constraints import Baumgarte
 from forcegp.files import Record
 from forcegp.options import StructuredOptions, Window
+from forcegp.robot.tree import Base
 from forcegp.simulate.config import SimulationConfig
 from forcegp.storage.system import ConnectionFields, ContactFields, Point
 
