@@ -35,9 +35,25 @@ def test_a_clock_that_restarts_begins_a_trajectory() -> None:
 
 def test_a_step_back_within_a_trajectory_is_an_error_with_its_rows() -> None:
     t = np.arange(60) * 0.01
+    q = np.sin(t)[:, None]
     t[40], t[50:52] = t[38], t[45]
     with pytest.raises(DataError, match=r"runs backward in rows 40, 50(?s:.*)0.39 s in row 40(?s:.*)0.38 s"):
-        split(signals(t))
+        split(signals(t, q=q))
+
+
+def test_rows_out_of_order_are_sorted_and_named() -> None:
+    """The positions show that rows were swapped, and not the clock set back."""
+    t = np.arange(60) * 0.01
+    order = np.r_[:20, 21, 20, 22:40, 42, 43, 40, 41, 44:60]
+    s = signals(t[order], q=np.sin(t)[order, None])
+    report = split(s)
+    assert s.t.tolist() == t.tolist()
+    assert s.vectors["q"][:, 0].tolist() == np.sin(t).tolist()
+    assert s.row.tolist() == np.argsort(order).tolist()
+    (found,) = report.findings
+    assert found.kind == "order"
+    assert "3 rows were out of order" in found.message
+    assert s.segment.max() == 0
 
 
 def test_gaps_begin_a_trajectory() -> None:

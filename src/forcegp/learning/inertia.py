@@ -170,11 +170,11 @@ def torque_scale(robot: RobotModel, rows: Rows, std: float) -> tuple[Tensor, Ten
     known, every = spread < UNDETERMINED, found.by_stretch.total()
     while True:
         u = found.estimate(every, torch.cat([drives, gains[known]]), n)[n : 2 * n]
-        beyond = u.abs() > FARTHEST
+        g = 1.0 + std * u
+        beyond = (u.abs() > FARTHEST) | (g < LEAST_GAIN)
         if not bool(beyond.any()):
             break
         known = known & ~beyond
-    g = 1.0 + std * u
     return 1.0 / g, std * torch.where(known, spread / g**2, 1.0).clamp(max=1.0)
 
 
@@ -378,9 +378,9 @@ VOLUME_STATES = 100
 IDENTIFIED = "identified inertia replaces that of the robot file, since it predicts held-out torques better"
 UNDETERMINED = 0.5
 """Standard deviation of a scale, over the stated one, from which on the torque is the nominal one."""
-FARTHEST = 3.0
-"""Stated standard deviations beyond which a scale stays nominal, as the torque of the links is too small to
-show it. Without this bound, one of 104 simulated torques from currents becomes ten times as large."""
+LEAST_GAIN, FARTHEST = 0.1, 3.0
+"""Least g, and stated standard deviations beyond which a scale stays nominal, as the torque of the links is
+too small to show it. Without this, one of 104 simulated torques from currents becomes ten times as large."""
 ROUNDS = 2
 """Number of further estimates of the scales for identified links, each with those of the previous one."""
 GAIN = 0.02

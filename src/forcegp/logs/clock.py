@@ -119,6 +119,7 @@ def _sort(signals: Signals, report: ImportReport) -> bool:
     late = signals.t < latest
     report.find("order", f"{late.sum()} rows were out of order, and were sorted by time", signals.row[late])
     signals.reorder(order)
+    drop_repeated(signals, report)
     return True
 
 

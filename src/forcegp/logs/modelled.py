@@ -18,8 +18,9 @@ from forcegp.robot import RobotModel
 NOISE = 2e-6
 """White noise of a torque over its RMS below which it is not measured. The `Torque` of a Kinova Gen3 has
 less than 1.3e-6, and its currents have .008 to .9; filtered torques of an iiwa 14 have 6e-6 and more."""
-FREE = 1.2
-"""Ratio of residuals without and with friction below which a torque has none: 1.0 for this `Torque`, in the
+EXPLAINED, FREE = 0.2, 1.2
+"""Residual of a model over the RMS torque, .01 to .06 for this `Torque` in the median over its joints; and
+ratio of residuals without and with friction below which a torque has none: 1.0 for this `Torque`, in the
 median over its joints, and 7 for the currents of a UR10, whose driver filters them to a noise below 1e-9."""
 ROWS, RISE, RIDGE, CHANGES, FEWEST = 3000, 0.02, 1e-4, 0.5, 100
 """Maximum number of rows in this regression, speed over which dry friction rises [rad/s, m/s], relative ridge
@@ -50,13 +51,14 @@ def find_modelled(
     rows = np.unique(np.linspace(0, n - 1, min(n, ROWS)).round().astype(int))
     q, qd, qdd, tau = (signals.vectors[name][rows] for name in ("q", "qd", "qdd", "tau"))
     Y = regressor(robot, *(torch.from_numpy(np.ascontiguousarray(x)) for x in (q, qd, qdd))).numpy()
-    ratios = []
+    sizes, ratios = [], []
     for j in np.flatnonzero(smooth):
         inertial = np.column_stack([Y[:, j], qdd[:, j], np.ones(len(rows))])
         friction = np.column_stack([qd[:, j], np.tanh(qd[:, j] / RISE)])
-        with_friction = _left(np.column_stack([inertial, friction]), tau[:, j])
-        ratios.append(_left(inertial, tau[:, j]) / max(with_friction, 1e-300))
-    if np.median(ratios) < FREE:
+        left, less = (_left(X, tau[:, j]) for X in (inertial, np.column_stack([inertial, friction])))
+        sizes.append(left / max(float(np.sqrt(np.mean(tau[:, j] ** 2))), 1e-300))
+        ratios.append(left / max(less, 1e-300))
+    if np.median(ratios) < FREE and np.median(sizes) < EXPLAINED:
         names = ", ".join(np.array(signals.joint_names)[smooth])
         text = f"the torque of {names} has neither noise nor friction: the output of a model or a simulator"
         report.find("modelled", text)
