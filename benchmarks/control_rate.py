@@ -369,7 +369,7 @@ def rolled_out(name: str, fit: StructuredFit) -> dict[str, float]:
     """Seconds of processor time of function samples that follow another run for 10 s at 240 Hz, and of making
     the C code before."""
     run = simulate(fit.system, SimulationConfig(duration=10.1, seed=2)).data
-    gains, rate = 25.0 * dynamics.mass_matrix(fit.system.robot, run.q[0]).diagonal(), 1.0 / forward.STEP
+    gains, rate = 25.0 * dynamics.mass_matrix(fit.system.robot, run.q[0]).diagonal(), 1.0 / inputs.STEP
 
     def law(t: Tensor, q: Tensor, qd: Tensor) -> Tensor:
         k = (t[..., 0] * rate + 0.5).long().clamp(max=len(run) - 1)

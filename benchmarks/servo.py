@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 import torch
 from real_cases import example_robot
+from scipy.interpolate import CubicHermiteSpline
 from sysid_peer import identified_servos, specification
 
 import forcegp
@@ -167,8 +168,11 @@ def compared(name: str, rate: int, seed: int, noise: float, with_peer: bool) -> 
     for k in range(PLAYED):
         part = test[k * rows : (k + 1) * rows + 1]
         path = fit.rollout(part.q[0], part.qd[0], part, duration=LENGTH)
-        at = ((part.t - part.t[0]) / (path.t[1] - path.t[0])).round().long().clamp(max=len(path.t) - 1)
-        ours.append(float((path.q.reshape(len(path.t), -1)[at] - part.q).square().mean()))
+        steps, joints = len(path.t), arm.robot.nq
+        q, qd = (x.reshape(steps, joints).numpy() for x in (path.q, path.qd))
+        # Steps are not those of the log.
+        played = CubicHermiteSpline(path.t.numpy(), q, qd)((part.t - part.t[0]).numpy().clip(max=LENGTH))
+        ours.append(float(np.square(played - part.q.numpy()).mean()))
         file.append(arm.file_error(part, command, rate))
         peers.append(arm.file_error(part, command, rate, peer) if with_peer else np.nan)
     own = {p.name: p for p in fit.parameters()}

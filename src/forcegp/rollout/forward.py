@@ -15,13 +15,11 @@ from forcegp.constraints.unilateral import any_row
 from forcegp.data import Dataset
 from forcegp.errors import ForceGPError, ModelError, check_name
 from forcegp.resources import one_thread
-from forcegp.rollout.inputs import Disturbance, Disturbed, ForwardModel, Torque, inputs_of
+from forcegp.rollout.inputs import STEP, Disturbance, Disturbed, ForwardModel, Torque, inputs_of
 from forcegp.rollout.integrate import METHODS, Progress, integrate
 from forcegp.rollout.law import ForceLaw, Law, RolloutProblem, State, law_of
 from forcegp.rollout.trajectory import FIELDS, DivergedError, Rollout
 
-STEP = 1.0 / 240.0
-"""Step size of a rollout under a feedback law in continuous time [s]."""
 CLOSED = 5e-4
 """A contact that can open is initially closed if its constraint error is below this value [m]. The value is
 larger than the drift of a logged contact, but smaller than the distance of a tip that is off the surface.

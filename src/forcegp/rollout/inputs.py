@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -18,6 +19,8 @@ from forcegp.data import Dataset
 from forcegp.errors import DataError, ModelError, ShapeError, UnknownNameError
 from forcegp.forces.quantities import ForceField
 
+STEP = 1.0 / 240.0
+"""Step size of a rollout under a feedback law in continuous time [s]."""
 INTERPOLATIONS = ("hold", "linear")
 EDGE = 1e-6
 """Fraction of a sampling period within which a time counts as a sampling time, to allow for rounding."""
@@ -183,6 +186,11 @@ class Commands(Inputs):
     positions: Sampled
     stiffness: Tensor
     damping: Tensor
+
+    @property
+    def period(self) -> float:
+        """Largest step of at most `STEP` of which the sampling period of the commands is a multiple [s]."""
+        return self.positions.dt / math.ceil(self.positions.dt / STEP - 1e-6)
 
     @classmethod
     def of(cls, log: Dataset) -> Commands:
