@@ -49,7 +49,7 @@ from forcegp.models.export.casadi_function import casadi_function
 from forcegp.models.export.library import CompiledFit
 from forcegp.models.prediction import Predictor
 from forcegp.models.structured_fit import StructuredFit
-from forcegp.rollout import RolloutOptions, forward
+from forcegp.rollout import RolloutOptions, inputs
 from forcegp.simulate import SimulationConfig, simulate
 
 POINTS, STATES, ROUNDS, SAMPLES = 71, 256, 60, 100
