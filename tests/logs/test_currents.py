@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,8 @@ import torch
 
 import forcegp
 from forcegp.checks import check
-from forcegp.errors import MappingError
+from forcegp.errors import DataError, MappingError, ModelError
+from forcegp.evaluation.judgement import torque_response
 from forcegp.logs import import_log
 from forcegp.logs.mapping import parse_mapping
 from forcegp.models.calibrated import write_calibrated
@@ -106,10 +108,58 @@ def test_programs_and_files_have_the_scales(fit: StructuredFit, folder: Path, tm
         assert theirs.covariance is not None
         torch.testing.assert_close(ours.mean, theirs.mean, rtol=1e-9, atol=1e-9)
         torch.testing.assert_close(ours.covariance, theirs.covariance, rtol=1e-6, atol=1e-9)
+    # Beyond the trained region, too
+    far = test.q, test.qd, 3.0 * test.tau
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        ours, theirs = fit.compiled().predict(*far), fit.predict(*far)
+    assert theirs.beyond is not None
+    assert float(theirs.beyond.max()) > 0.0
+    assert ours.covariance is not None
+    torch.testing.assert_close(ours.covariance, theirs.covariance, rtol=1e-6, atol=1e-9)
+    torch.testing.assert_close(ours.beyond, theirs.beyond, rtol=1e-9, atol=1e-12)
+    torch.testing.assert_close(fit.beyond(far[1], far[2]), theirs.beyond)
     along = fit.linearize(*(x[:3] for x in state))
     for j, step in enumerate(1e-5 * torch.eye(3, dtype=torch.float64)):
         ends = [fit.predict(*(x[:3] for x in state[:2]), test.tau[:3] + s * step).mean for s in (1.0, -1.0)]
         torch.testing.assert_close(along.dtau[..., j], (ends[0] - ends[1]) / 2e-5, rtol=1e-5, atol=1e-5)
+
+
+def test_an_added_current_has_its_full_effect(fit: StructuredFit, folder: Path) -> None:
+    test = forcegp.read_log(folder / "test.npz", fit.specified.robot, mapping())
+    response = torque_response(fit, fit.system.robot, test)
+    assert response == pytest.approx([1.0, 1.0, 1.0], abs=0.02)
+
+
+def test_currents_are_not_mixed_with_measured_torques(folder: Path, robot: forcegp.RobotModel) -> None:
+    known = forcegp.read_log(folder / "test.npz", robot, mapping("torque_constant_std = 0.0"))
+    currents = forcegp.read_log(folder / "test.npz", robot, mapping())
+    with pytest.raises(DataError, match="unknown scales"):
+        forcegp.Dataset.concatenate([known, currents])
+    other = forcegp.read_log(folder / "test.npz", robot, mapping("torque_constant_std = 0.1"))
+    assert forcegp.Dataset.concatenate([other, currents]).header.torque_scale_std == 0.3
+    first = forcegp.StructuredGP(forcegp.ConstrainedSystem(robot)).fit(known)
+    with pytest.raises(ModelError, match="unknown scales"):
+        forcegp.StructuredGP(forcegp.ConstrainedSystem(robot)).fit(currents, after=first)
+
+
+def test_constants_beyond_what_is_stated_are_named(folder: Path, robot: forcegp.RobotModel) -> None:
+    wrong = mapping("torque_constant_std = 0.2", np.array([2.0, 0.85, 1.0]))
+    data = forcegp.read_log(folder / "train.npz", robot, wrong)
+    fit = forcegp.StructuredGP(forcegp.ConstrainedSystem(robot)).fit(data)
+    (doubt,) = (text for text in fit.result.warnings if "beyond what is stated" in text)
+    assert "a 0.5" in doubt
+
+
+def test_scales_are_learned_with_the_inertia_of_the_file(folder: Path) -> None:
+    """Otherwise, the best fit would be no torque at all."""
+    robot = forcegp.load_robot(folder / "arm.xml")
+    robot = robot.replace(armature=robot.armature + torch.from_numpy(ARMATURE))
+    data = forcegp.read_log(folder / "train.npz", robot, mapping())
+    fit = forcegp.StructuredGP(forcegp.ConstrainedSystem(robot), inertia="file").fit(data)
+    assert fit.system.robot.torque_scale is not None
+    error = fit.system.robot.torque_scale[:2] * torch.from_numpy(WRONG[:2]) - 1.0
+    assert float(error.abs().max()) < 0.05
 
 
 def test_rollouts_scale_nominal_torques_once(fit: StructuredFit, folder: Path) -> None:
@@ -134,6 +184,18 @@ def test_written_motors_and_servos_are_scaled(fit: StructuredFit, folder: Path, 
     scales = [p for p in found.parameters if p.name == "torque_scale"]
     assert [p.element for p in scales] == ["a", "b", "c"]
     assert [p.determined for p in scales] == [True, True, False]
+
+
+def test_a_motor_with_inertia_is_left_alone(folder: Path, tmp_path: Path) -> None:
+    """Its armature acts on the joint with the square of the gear."""
+    text = (folder / "arm.xml").read_text().replace('joint="a"', 'joint="a" armature="0.02" damping="0.1"')
+    (tmp_path / "arm.xml").write_text(text)
+    robot = forcegp.load_robot(tmp_path / "arm.xml")
+    scaled = robot.replace(torque_scale=torch.tensor([1.2, 1.1, 1.0], dtype=torch.float64))
+    written = write_robot(scaled, tmp_path / "arm.xml", tmp_path / "out.xml")
+    assert [change.element for change in written.changes] == ["b", "b"]
+    (loss,) = written.losses
+    assert "a 1.2" in loss
 
 
 def test_urdf_names_the_scales_that_it_cannot_hold(tmp_path: Path) -> None:

@@ -12,7 +12,8 @@ from torch import Tensor
 
 import forcegp
 from forcegp import dynamics, kinematics
-from forcegp.errors import RobotFileError, UnknownNameError
+from forcegp.errors import RobotFileError, UnknownNameError, UnsupportedRobotError
+from forcegp.forces.posterior import SPREAD, trained_region
 from forcegp.robot.free_base import BASE_JOINTS
 from forcegp.robot.write_back import write_robot
 from pinocchio_oracle import pin
@@ -197,3 +198,63 @@ def test_unclear_bases_are_named(tmp_path: Path) -> None:
     (tmp_path / "named.urdf").write_text(text)
     with pytest.raises(RobotFileError, match="'base_x' has the name of a joint of the free base"):
         forcegp.load_robot(tmp_path / "named.urdf", base="free")
+
+
+def urdf(path: Path, joints: str, links: str = "world a b") -> Path:
+    """A URDF of links, all but `world` with inertia."""
+    body = '<inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>'
+    text = "".join(f'<link name="{x}">{"" if x == "world" else body}</link>' for x in links.split())
+    path.write_text(f'<robot name="r">{text}{joints}</robot>')
+    return path
+
+
+def joint(name: str, kind: str, parent: str, child: str) -> str:
+    """A joint of a URDF."""
+    return f'<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/></joint>'
+
+
+def test_no_joint_is_lost(tmp_path: Path) -> None:
+    hinge = joint("j2", "continuous", "a", "b")
+    fixed = urdf(tmp_path / "fixed.urdf", joint("j1", "fixed", "world", "a") + hinge)
+    assert forcegp.load_robot(fixed, base="free").joint_names == (*BASE_JOINTS, "j2")
+    moving = urdf(tmp_path / "rail.urdf", joint("j1", "prismatic", "world", "a") + hinge)
+    pair = joint("j1", "fixed", "world", "a") + joint("j2", "fixed", "world", "b")
+    several = urdf(tmp_path / "two.urdf", pair)
+    for path in (moving, several):
+        with pytest.raises(RobotFileError, match="base of the robot is not clear"):
+            forcegp.load_robot(path, base="free")
+    both = joint("f", "floating", "world", "a") + joint("g", "floating", "world", "b")
+    with pytest.raises(UnsupportedRobotError, match="several joints are floating"):
+        forcegp.load_robot(urdf(tmp_path / "floating.urdf", both), base="free")
+
+
+def test_defaults_do_not_act_on_the_base(tmp_path: Path) -> None:
+    defaults = '<joint damping="0.3" actuatorfrcrange="-5 5"/>'
+    text = HOPPER.replace('<joint damping="0.3" armature="0.01"/>', defaults)
+    (tmp_path / "hopper.xml").write_text(text)
+    robot = forcegp.load_robot(tmp_path / "hopper.xml", base="free")
+    assert robot.effort_limit[:6].isinf().all()
+    inside = HOPPER.replace('<freejoint name="root"/>', '<frame><freejoint name="root"/></frame>')
+    (tmp_path / "frame.xml").write_text(inside)
+    with pytest.raises(RobotFileError, match="base of the robot is not clear"):
+        forcegp.load_robot(tmp_path / "frame.xml", base="free")
+
+
+def test_a_base_has_no_friction_in_written_files(tmp_path: Path) -> None:
+    source = LEGGED[0].path
+    robot = forcegp.load_robot(source, base="free")
+    rough = robot.replace(damping=robot.damping + 0.01, mass=1.1 * robot.mass)
+    written = write_robot(rough, source, tmp_path / "out.urdf")
+    assert any("free base has no damping" in loss for loss in written.losses)
+    again = forcegp.load_robot(tmp_path / "out.urdf", base="free")
+    torch.testing.assert_close(again.mass, rough.mass, rtol=1e-6, atol=1e-9)
+    locked = {"base_z": 0.0, "base_pitch": 0.0, "base_roll": 0.0}
+    planar = forcegp.load_robot(source, base="free", locked_joints=locked)
+    changed = planar.replace(mass=1.1 * planar.mass)
+    assert write_robot(changed, source, tmp_path / "planar.urdf", locked_joints=locked).changes
+
+
+def test_joints_without_any_load_have_a_trained_region() -> None:
+    load = torch.tensor([1.0, 0.0], dtype=torch.float64)
+    x = torch.randn(100, 2, dtype=torch.float64) * load
+    assert (trained_region(x, x, load)[SPREAD] > 0.0).all()

@@ -400,6 +400,15 @@ def common_header(headers: Sequence[DataHeader]) -> DataHeader:
     agreed["provenance"] = (*steps, f"concatenated {len(headers)} data sets")
     for name in ("derived", "imported"):
         agreed[name] = tuple(dict.fromkeys(value for header in headers for value in getattr(header, name)))
+    stated = [header.torque_scale_std for header in headers]
+    if any(std is None for std in stated) and any(std is not None for std in stated):
+        raise DataError(
+            "torques with unknown scales cannot be concatenated with measured ones",
+            expected="all from currents or servos, or all measured",
+            got=", ".join("measured" if std is None else "currents or commands" for std in stated[:8]),
+            hint="import the currents with torque_constant_std = 0 if their constants are known",
+        )
+    agreed["torque_scale_std"] = max((std for std in stated if std is not None), default=None)
     agreed["stick_speeds"] = common_stick_speeds(headers)
     agreed["ordered"] = all(header.ordered for header in headers)
     agreed["filtered"] = any(header.filtered for header in headers)

@@ -122,7 +122,8 @@ def torque_response(model: FittedModel, robot: RobotModel, data: Dataset) -> tup
     active = closed[rows].expand(nq + 1, n, -1).flatten(0, 1)
     qdd = model.predict(q, qd, tau, active=active, covariance=False).mean.unflatten(0, (nq + 1, n))
     acts = (dynamics.mass_matrix(robot, data.q) @ (qdd[1:] - qdd[0])[..., None])[..., 0]
-    return tuple((acts[joints, :, joints].mean(-1) / step).tolist())
+    acting = model.system.robot.true_torque(torch.diag(step)).diagonal()
+    return tuple((acts[joints, :, joints].mean(-1) / acting).tolist())
 
 
 @torch.no_grad()

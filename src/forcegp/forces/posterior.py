@@ -50,6 +50,8 @@ OUTERMOST, WIDEST = 0.01, 0.16
 """Smallest and largest fraction of the training samples beyond each limit of the region. The largest is the
 tail of a Gaussian beyond one standard deviation. At least one independent sample lies beyond.
 """
+UNLOADED = 1e-6
+"""Least load of a joint, relative to the largest: a free base may have neither torque nor load."""
 RELATIVE = 0.05
 """Prior ratio of the growth rate g to the typical load of a joint; torque constants and load-dependent
 friction are uncertain by about 5 %. If it were the rate, errors of an external force on a simulated UR5 would
@@ -185,6 +187,7 @@ def trained_region(qd: Tensor, tau: Tensor, load: Tensor, independent: float = m
     x = torch.stack([qd, tau], dim=1)
     share = min(max(OUTERMOST, 1.0 / independent), WIDEST)
     low, high = x.quantile(torch.tensor([share, 1.0 - share]).to(x), dim=0)
+    load = load.maximum(UNLOADED * load.max()).clamp(min=1e-12)
     least = torch.stack([torch.full_like(load, STICKING), RELATIVE * load])
     spread = x.std(0, correction=0).maximum(least)
     return {LOW: low, HIGH: high, SPREAD: spread}

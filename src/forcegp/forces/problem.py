@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.errors import ModelError
-from forcegp.forces.measurements import Training, scaled
+from forcegp.forces.measurements import Measurement, Training, scaled
 from forcegp.forces.noise import TORQUE_NOISE, ForceNoise, SampleNoise, state_jacobian
 from forcegp.forces.posterior import ForcePosterior, ForceProcess, hidden_variance, trained_region
 from forcegp.forces.priors.base import ANALYTICAL, NOISE, RESERVED, ForceMean, ForcePrior
@@ -237,12 +237,17 @@ class Problem:
         squares = [at.tau**2 + at.eom.Q_G**2 + at.eom.Q_C**2 for at in states]
         return torch.cat(squares).mean(0).sqrt()
 
+    def torque(self, m: Measurement) -> Tensor:
+        """Return the torques `(n, nq)` that act in the samples of a measurement."""
+        return self.system.robot.true_torque(m.tau)
+
     @cached_property
     @torch.no_grad()
     def region(self) -> dict[str, Tensor]:
         """Region of speeds and torques in the training data, from at most `REGION_STATES` samples."""
         training = self.training.evenly(REGION_STATES)
-        qd, tau = (torch.cat([getattr(m, name) for m in training.measurements]) for name in ("qd", "tau"))
+        each = ((m.qd, self.torque(m)) for m in training.measurements)
+        qd, tau = map(torch.cat, zip(*each, strict=True))
         return trained_region(qd, tau, dataclasses.replace(self, training=training).typical_load())
 
     def negative_log_likelihood(self, params: Tensors, rows: WhitenedRows) -> Tensor:

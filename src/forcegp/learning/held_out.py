@@ -56,7 +56,8 @@ PRIOR_SAMPLES = 4.0
 def calibrated_noise(problem: Problem, hyperparameters: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """Return torque noise calibrated on held-out samples, the trained region, and error growth outside it."""
     load, training = problem.typical_load(), problem.training
-    qd, tau = (torch.cat([getattr(m, name) for m in training.measurements]) for name in ("qd", "tau"))
+    each = ((m.qd, problem.torque(m)) for m in training.measurements)
+    qd, tau = map(torch.cat, zip(*each, strict=True))
     # Rounding to steps h has the variance h²/12.
     rounding = torch.from_numpy(resolution(tau.cpu().numpy())).to(tau) / math.sqrt(12.0)
     learned = hyperparameters[TORQUE_NOISE].exp().maximum(rounding)
@@ -131,17 +132,18 @@ def growth(problem: Problem, hyperparameters: Mapping[str, Tensor], load: Tensor
     s2, square, known, slope = hyperparameters[TORQUE_NOISE].exp() ** 2, [], [], []
     for i in problem.training.motions:
         m = problem.training.measurements[i]
-        for x in (m.qd, m.tau):
+        tau = problem.torque(m)
+        for x in (m.qd, tau):
             intensity = ((x - x.mean(0)) / x.std(0).clamp(min=1e-12)).abs().amax(-1)
             top = intensity > intensity.quantile(1.0 - REGIME)
             if min(int(top.sum()), int((~top).sum())) < FEWEST:
                 continue
-            rest = trained_region(m.qd[~top], m.tau[~top], load)
+            rest = trained_region(m.qd[~top], tau[~top], load)
             own = top.nonzero()[:, 0]
             others = dataclasses.replace(problem, training=problem.training.without(i, own))
             posterior = force_posterior(others, hyperparameters)
             residual, V, P = _held_out(problem, hyperparameters, posterior, i, own)
-            D = distance_beyond(rest, m.qd[own], m.tau[own])
+            D = distance_beyond(rest, m.qd[own], tau[own])
             reached = (P.diagonal(dim1=-2, dim2=-1) > 0.5) & (D > 0.0)
             square.append(residual.square()[reached])
             known.append((V + P.square() @ s2)[reached])

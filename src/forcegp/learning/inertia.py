@@ -142,21 +142,28 @@ def rescaled_robot(robot: RobotModel, rows: Rows, std: float) -> Inertia:
         rows: samples in free motion with nominal torques.
         std: stated standard deviation of s.
     """
-    scale, spread = torque_scale(robot, rows, std)
+    scale, spread, beyond = torque_scale(robot, rows, std)
     found = rigid_robot(robot, rows.scaled(scale))
     for _ in range(ROUNDS if IDENTIFIED in found.doubts else 0):
         # Y π for the changed links
         before, after = (inertial_parameters(x.mass, x.com, x.inertia) for x in (robot, found.robot))
         change = (links_at(robot, rows) @ (after - before).flatten()[:, None])[..., 0]
         known = dataclasses.replace(rows, residual=rows.residual - change)
-        scale, spread = torque_scale(robot, known, std)
+        scale, spread, later = torque_scale(robot, known, std)
+        beyond = torch.where(beyond > 0.0, beyond, later)
         found = rigid_robot(robot, rows.scaled(scale))
     robot = found.robot.replace(torque_scale=scale)
-    return dataclasses.replace(found, robot=robot, spread=tuple(spread.tolist()))
+    far = [(joint, x) for joint, x in zip(robot.joint_names, beyond.tolist(), strict=True) if x]
+    listed = ", ".join(f"{joint} {x:.2g}" for joint, x in far)
+    doubt = f"torques seem to be the nominal ones times {listed}, which is beyond what is stated of them"
+    doubts = (f"{doubt}, so they stay nominal: correct the constants, or state larger errors",) if far else ()
+    doubts = (*found.doubts, *doubts)
+    return dataclasses.replace(found, robot=robot, spread=tuple(spread.tolist()), doubts=doubts)
 
 
-def torque_scale(robot: RobotModel, rows: Rows, std: float) -> tuple[Tensor, Tensor]:
-    """Return the scales 1 + s `(nq,)` of torques for known links and unknown drives, and σ(s).
+def torque_scale(robot: RobotModel, rows: Rows, std: float) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the scales 1 + s `(nq,)` of torques for known links and unknown drives, σ(s), and the scales
+    that are too far from 1 to be believed, or 0.
 
     With the known torque u of the links, τ = g (u + d q̈) + Φ w is linear in g = 1/(1 + s) and in g d. With
     the equivalent (1 + s) τ = u + d q̈ + Φ w, noise of τ would favour s = −1, where nothing of it is left.
@@ -167,15 +174,16 @@ def torque_scale(robot: RobotModel, rows: Rows, std: float) -> tuple[Tensor, Ten
     _, found = _regressions(rows, size * torch.diag_embed(rows.qdd), M, std)
     drives, gains = torch.arange(n), torch.arange(n, 2 * n)
     spread = found.read(2 * n, torch.cat([drives, gains]))[1][n:].sqrt()
-    known, every = spread < UNDETERMINED, found.by_stretch.total()
+    known, every, rejected = spread < UNDETERMINED, found.by_stretch.total(), torch.zeros_like(spread)
     while True:
         u = found.estimate(every, torch.cat([drives, gains[known]]), n)[n : 2 * n]
         g = 1.0 + std * u
         beyond = (u.abs() > FARTHEST) | (g < LEAST_GAIN)
         if not bool(beyond.any()):
             break
+        rejected = torch.where(beyond, 1.0 / g.clamp(min=LEAST_GAIN), rejected)
         known = known & ~beyond
-    return 1.0 / g, std * torch.where(known, spread / g**2, 1.0).clamp(max=1.0)
+    return 1.0 / g, std * torch.where(known, spread / g**2, 1.0).clamp(max=1.0), rejected
 
 
 def _regressions(
@@ -423,6 +431,7 @@ def inertia_of(
     mean: ForceMean,
     training: Training,
     scale_std: float | None = None,
+    links: bool = True,
 ) -> Inertia:
     """Identify the inertia of a real robot from samples in free motion.
 
@@ -435,15 +444,19 @@ def inertia_of(
         mean: prior mean of Q, including the motor torque.
         training: samples in motion.
         scale_std: standard deviation of the relative scale of torques that are not measured.
+        links: whether links and drives may differ from the robot file, or only such scales.
     """
     if training.free_motions < LEAST:
         size = drive_scale(system.robot, torch.cat([m.q for m in training.measurements]))
         spread = () if scale_std is None else (scale_std,) * system.robot.nq
-        return Inertia(system.robot, _errors(system.robot, size), (), spread)
+        return Inertia(system.robot, _errors(system.robot, size) if links else None, (), spread)
     rows = free_rows(system, friction, mean, training).with_memory()
     rows = with_ripple(system.robot, rows)
     if scale_std is None:
         return rigid_robot(system.robot, rows)
+    if not links:
+        scale, spread, _ = torque_scale(system.robot, rows, scale_std)
+        return Inertia(system.robot.replace(torque_scale=scale), spread=tuple(spread.tolist()))
     return rescaled_robot(system.robot, rows, scale_std)
 
 

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
 from forcegp.data.fields import common_stick_speeds
-from forcegp.errors import check_name
+from forcegp.errors import ModelError, check_name
 from forcegp.forces.measurements import (
     Observation,
     Training,
@@ -127,15 +127,13 @@ class Specification:
     def inertia_of(self, training: Training) -> Inertia:
         """Return the inertia identified from the training samples if requested, or that of the robot file."""
         friction = next((prior for prior in self.priors if isinstance(prior, JointFrictionPrior)), None)
-        asks = (
-            self.options.inertia == "auto"
-            and "actuation" in self.mean.terms
-            and self.analytical_parameters is None
-        )
+        scale = next((prior.std for prior in self.priors if isinstance(prior, DrivePrior)), None)
+        links = self.options.inertia == "auto"
+        known = "actuation" in self.mean.terms and self.analytical_parameters is None
+        asks = known and (links or (self.automatic and scale is not None))
         if friction is None or not asks or any(isinstance(prior, InertialPrior) for prior in self.priors):
             return Inertia(self.system.robot)
-        scale = next((prior.std for prior in self.priors if isinstance(prior, DrivePrior)), None)
-        found = inertia_of(self.system, friction, self.mean, training, scale)
+        found = inertia_of(self.system, friction, self.mean, training, scale, links)
         return found if training.free_motions >= LEAST else replace(found, doubts=_unchecked_masses(training))
 
     def problem(self, training: Training, robot: RobotModel | None = None) -> Problem:
@@ -197,6 +195,7 @@ def problem_for(
     """
     training, doubts = training_for(spec, before, data, chosen)
     robot = spec.system.robot
+    _check_scales(spec, before)
     if before is not None and any(prior.is_error for prior in spec.priors):
         robot = before.system.robot
     elif before is None and chosen is None:
@@ -206,8 +205,22 @@ def problem_for(
             spec = spec.with_spread(found.spread)
         if found.errors is not None:
             spec = dataclasses.replace(spec, priors=(*spec.priors, found.errors))
+        if found.spread or found.errors is not None:
             training, _ = training_for(spec, before, data, chosen)
     return spec, spec.problem(dataclasses.replace(training, part_of=part_of), robot), doubts
+
+
+def _check_scales(spec: Specification, before: Problem | None) -> None:
+    """Raise `ModelError` if torques have unknown scales, and an earlier fit took them as measured."""
+    if before is None or not any(isinstance(prior, DrivePrior) for prior in spec.priors):
+        return
+    if not any(isinstance(prior, DrivePrior) for prior in before.priors):
+        raise ModelError(
+            "the torques of this log have unknown scales, and the earlier fit has none",
+            expected="a log with measured torques",
+            got="currents or commands of servos",
+            hint="fit without after=, or import with torque_constant_std = 0 if the constants are known",
+        )
 
 
 def training_for(

@@ -127,7 +127,7 @@ class StructuredFit(FittedModel):
             mean, spread = self._read(system, at, z, parts, query.noise)
         else:
             mean, spread = self.posterior.read_mean(system, at, z), None
-        hidden, beyond = hidden_forces(system, at, parts, unseen), self.beyond(at.qd, at.tau)
+        hidden, beyond = hidden_forces(system, at, parts, unseen), self._distance(at.qd, at.tau)
         if hidden is None:
             return (mean, spread, beyond, torch.ones_like(mean, dtype=torch.bool)), parts, ()
         return (*hidden.applied(mean, spread), beyond, ~hidden.whole), parts, hidden.doubts
@@ -354,6 +354,10 @@ class StructuredFit(FittedModel):
         """Return how far speeds and torques exceed the training data, `(*batch, nq)`, in standard deviations
         of these data. The result is `None` if the model file does not contain the trained region.
         """
+        return self._distance(qd, self.system.robot.true_torque(tau))
+
+    def _distance(self, qd: Tensor, tau: Tensor) -> Tensor | None:
+        """Return this distance for torques that act, not nominal ones."""
         region = self._region
         return distance_beyond(region, qd, tau) if LOW in region else None
 

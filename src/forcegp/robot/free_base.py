@@ -39,7 +39,7 @@ def with_free_base(tree: Tree, floating: str | None = None) -> Tree:
         floating: name of this joint, if there is one.
 
     Raises:
-        RobotFileError: a joint has the name of one of the six.
+        RobotFileError: a joint has the name of one of the six, or it is not clear which link is the base.
     """
     for joint in tree.joints:
         if joint.name in KINDS:
@@ -47,8 +47,13 @@ def with_free_base(tree: Tree, floating: str | None = None) -> Tree:
             raise RobotFileError(text, expected=f"other names than {', '.join(BASE_JOINTS)}")
     children = {joint.child for joint in tree.joints}
     (root, *_) = [link.name for link in tree.links if link.name not in children] or [tree.links[0].name]
-    of_world = [joint for joint in tree.joints if joint.name == floating or joint.parent == root == WORLD]
-    replaced = of_world[:1] if floating is not None or len(of_world) == 1 else []
+    below = [joint for joint in tree.joints if joint.parent == root]
+    of_world = [joint for joint in tree.joints if joint.name == floating] if floating else below
+    if floating is None and root == WORLD and [joint.kind for joint in below] != ["fixed"]:
+        raise _unclear(tree.label, [joint.child for joint in below])
+    if floating is not None and of_world[0].parent != root:
+        raise _unclear(tree.label, [of_world[0].child])
+    replaced = of_world if floating is not None or root == WORLD else []
     body = replaced[0].child if replaced else root
     ground = replaced[0].parent if replaced else WORLD
     links = tree.links if replaced or root == ground else (Link(ground), *tree.links)
@@ -73,12 +78,10 @@ def free_mjcf(root: Element, label: str) -> None:
     bodies = [body for world in worlds for body in world.findall("body")]
     free = [body for body in bodies if _free_joints(body)]
     moving = free or [body for body in bodies if next(body.iter("joint"), None) is not None]
-    if len(moving) != 1:
-        raise RobotFileError(
-            f"{label}: the base of the robot is not clear",
-            expected="one body in <worldbody> with a free joint, or one with joints",
-            got=", ".join(repr(body.get("name", "(unnamed)")) for body in moving) or "no such body",
-        )
+    names = [body.get("name", "(unnamed)") for body in moving]
+    inside = any(part.tag == "freejoint" for world in worlds for part in world.iter()) and not free
+    if len(moving) != 1 or inside or (not free and moving[0].find("joint") is not None):
+        raise _unclear(label, names)
     (body,) = moving
     for joint in _free_joints(body):
         body.remove(joint)
@@ -88,7 +91,18 @@ def free_mjcf(root: Element, label: str) -> None:
         slide = "slide" if kind == "prismatic" else "hinge"
         values = {"name": name, "type": slide, "axis": _AXES[k], "pos": "0 0 0", "limited": "false"}
         plain = {"damping": "0", "frictionloss": "0", "armature": "0", "stiffness": "0", "ref": "0"}
+        plain |= {"springdamper": "0 0", "actuatorfrclimited": "false"}
         body.insert(k, Element("joint", {**values, **plain}))
+
+
+def _unclear(label: str, names: list[str]) -> RobotFileError:
+    return RobotFileError(
+        f"{label}: the base of the robot is not clear",
+        expected="one link fixed to the world or with a floating joint; or one body in <worldbody> with a "
+        "free joint, or without joints of its own",
+        got=", ".join(map(repr, names)) or "no such link",
+        hint="attach the robot to the world by one joint, outside of a <frame>",
+    )
 
 
 def _free_joints(body: Element) -> list[Element]:

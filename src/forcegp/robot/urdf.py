@@ -41,6 +41,9 @@ _KINDS = ("revolute", "continuous", "prismatic", "fixed")
 def read_urdf(root: Element, label: str, base: Base = "fixed") -> Tree:
     """Return the links and joints of a `<robot>` element. Errors name invalid or unsupported elements."""
     floating = [e for e in root.findall("joint") if e.get("type") == "floating"] if base == "free" else []
+    if len(floating) > 1:
+        text, names = f"{label}: several joints are floating", ", ".join(_name(e, label) for e in floating)
+        raise UnsupportedRobotError(text, expected="one floating joint", got=names)
     for element in floating:
         element.set("type", "fixed")
     for element in root.iter():

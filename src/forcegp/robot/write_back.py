@@ -103,8 +103,7 @@ def write_robot(
     """
     path, robot = robot_path(source), robot.to("cpu", torch.float64)
     data, locked = read_bytes(path), locked_joints or {}
-    base: Base = "free" if robot.joint_names[: len(BASE_JOINTS)] == BASE_JOINTS else "fixed"
-    content = read_tree(data, path, base)
+    base, content = _content(data, path, {*robot.joint_names, *locked})
     tree = checked(lock_joints(content, locked))
     file = robot_of(tree, _world(robot))
     if file.joint_names != robot.joint_names:
@@ -117,17 +116,29 @@ def write_robot(
     document = EditableXml(data, str(path))
     label, is_urdf = str(path), document.root.tag == "robot"
     writer = _Urdf(document, label) if is_urdf else _Mjcf(document, label, content)
+    if base == "free":
+        writer.of_base = tuple(i for i, name in enumerate(robot.joint_names) if name in BASE_JOINTS)
     changes = [*_joint_changes(writer, tree, robot, file), *_link_changes(writer, tree, robot, file)]
     scaled, unscaled = _scale_changes(writer, robot)
     changes += scaled
     written = document.written()
-    losses = (*_losses(robot, writer.figures), *unscaled)
+    losses = (*_losses(robot, writer.figures), *unscaled, *_base_losses(robot, writer))
     _check(
         robot, robot_of(checked(lock_joints(read_tree(written, path, base), locked)), _world(robot)), writer
     )
     with atomic_file(out) as temporary:
         temporary.write_bytes(written)
     return WrittenRobot(tuple(changes), losses)
+
+
+def _content(data: bytes, path: Path, joints: set[str]) -> tuple[Base, Tree]:
+    """Return the kind of base with which the file has the given joints, and its content."""
+    if joints.isdisjoint(BASE_JOINTS):
+        return "fixed", read_tree(data, path)
+    try:
+        return "free", read_tree(data, path, "free")
+    except RobotFileError:
+        return "fixed", read_tree(data, path)
 
 
 def is_mjcf(source: str | Path) -> bool:
@@ -144,6 +155,8 @@ def _joint_changes(writer: _Urdf | _Mjcf, tree: Tree, robot: RobotModel, file: R
     """Write changed joint parameters, without those of other drives, and return the changes."""
     changes, joints = [], {joint.name: joint for joint in tree.joints}
     for i, joint in enumerate(robot.joint_names):
+        if i in writer.of_base:
+            continue
         values = {}
         for figure, attribute in writer.figures.items():
             before, after = float(getattr(file, figure)[i]), float(getattr(robot, figure)[i])
@@ -267,10 +280,19 @@ def _losses(robot: RobotModel, figures: Mapping[str, str]) -> tuple[str, ...]:
     return tuple(losses)
 
 
+def _base_losses(robot: RobotModel, writer: _Urdf | _Mjcf) -> Iterator[str]:
+    """Yield the parameters of a free base, which no file has."""
+    for figure in writer.figures:
+        values = getattr(robot, figure)[list(writer.of_base)]
+        if bool((values != 0.0).any()):
+            yield f"a free base has no {figure} ({', '.join(f'{x:.4g}' for x in values.tolist())})"
+
+
 def _check(robot: RobotModel, read: RobotModel, writer: _Urdf | _Mjcf) -> None:
     """Compare a robot with the robot read from the written text; raise `RobotFileError` if they differ."""
     for figure in (*FLOORS, *writer.figures):
         wrong = _differing(figure, robot, read, 10.0 * SAME)
+        wrong = [i for i in wrong if figure in FLOORS or i not in writer.of_base]
         if wrong:
             raise RobotFileError(
                 f"{writer.label}: this would change the {figure} of joint {robot.joint_names[wrong[0]]!r}",
@@ -295,6 +317,7 @@ class _Urdf:
     """Attributes of a URDF document."""
 
     figures: ClassVar = {"damping": "damping", "friction": "friction"}
+    of_base: tuple[int, ...] = ()
 
     def __init__(self, document: EditableXml, label: str) -> None:
         self.document, self.label = document, label
@@ -343,6 +366,7 @@ class _Mjcf:
     """Attributes of an MJCF document."""
 
     figures: ClassVar = {"damping": "damping", "friction": "frictionloss", "armature": "armature"}
+    of_base: tuple[int, ...] = ()
 
     def __init__(self, document: EditableXml, label: str, content: Tree) -> None:
         self.document, self.label = document, label
@@ -383,7 +407,8 @@ class _Mjcf:
         changes = []
         for element, drive in zip(self._actuators, self._drives, strict=True):
             names = FORCES.get(element.tag, ())
-            if set(drive.ratios) == {joint}:
+            # The armature and damping of a motor grow with its gear.
+            if set(drive.ratios) == {joint} and not ("gear" in names and (drive.armature or drive.damping)):
                 for name in (name for name in names if drive.gains[name]):
                     value = drive.gains[name]
                     self.document.set(element, name, _text(scale * value))

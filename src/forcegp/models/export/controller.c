@@ -574,7 +574,8 @@ static void expected_force(const equations *restrict e, const double *restrict t
 static void distance(const double *restrict qd, const double *restrict tau, double *restrict beyond) {
   for (int i = 0; i < NQ; ++i) {
     const double v = fmax(fmax(LOW[0][i] - qd[i], qd[i] - HIGH[0][i]), 0.0) / SPREAD[0][i];
-    const double t = fmax(fmax(LOW[1][i] - tau[i], tau[i] - HIGH[1][i]), 0.0) / SPREAD[1][i];
+    const double torque = TORQUE_SCALE[i] * tau[i];
+    const double t = fmax(fmax(LOW[1][i] - torque, torque - HIGH[1][i]), 0.0) / SPREAD[1][i];
     beyond[i] = sqrt(v * v + t * t);
   }
 }
