@@ -129,6 +129,12 @@ def test_an_added_current_has_its_full_effect(fit: StructuredFit, folder: Path) 
     test = forcegp.read_log(folder / "test.npz", fit.specified.robot, mapping())
     response = torque_response(fit, fit.system.robot, test)
     assert response == pytest.approx([1.0, 1.0, 1.0], abs=0.02)
+    scale = fit.system.robot.torque_scale
+    assert scale is not None
+    scores = forcegp.evaluate(fit, test).predictors[0]
+    assert min(scores.explained) > 0.95
+    size = np.array(scores.torque.all) / np.array(scores.torque.normalised)
+    assert size == pytest.approx((test.tau * scale).std(0).numpy(), rel=0.01)
 
 
 def test_currents_are_not_mixed_with_measured_torques(folder: Path, robot: forcegp.RobotModel) -> None:
