@@ -369,6 +369,8 @@ def _gains(log: Log, names: tuple[str, ...], gains: Array) -> Finding:
         kind, among, text = "torque-sign", gains < 0.0, f"{text}: the sign is wrong"
     elif 2 * len(names) > log.nq > 1 and np.median(factor) > CURRENT:
         kind, among, text = "torque-current", gains > 0.0, f"{text}: currents, or torques on the motor side"
+    if kind == "torque-gain" and log.header.torque_scale_std is not None:
+        text = f"{text}; a fit learns scales of currents itself"
     joints = tuple(name for name, hit in zip(names, among, strict=True) if hit) or names
     return log.finding(kind, text, joints, **evidence)
 
