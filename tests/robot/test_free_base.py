@@ -240,6 +240,13 @@ def test_defaults_do_not_act_on_the_base(tmp_path: Path) -> None:
         forcegp.load_robot(tmp_path / "frame.xml", base="free")
 
 
+def test_an_actuator_of_the_free_joint_is_named(tmp_path: Path) -> None:
+    actuator = '<actuator><motor joint="root" gear="1 0 0 0 0 0"/></actuator></mujoco>'
+    (tmp_path / "driven.xml").write_text(HOPPER.replace("</mujoco>", actuator))
+    with pytest.raises(UnsupportedRobotError, match="<motor> acts on the free joint 'root'"):
+        forcegp.load_robot(tmp_path / "driven.xml", base="free")
+
+
 def test_a_base_has_no_friction_in_written_files(tmp_path: Path) -> None:
     source = LEGGED[0].path
     robot = forcegp.load_robot(source, base="free")

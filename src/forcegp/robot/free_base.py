@@ -12,7 +12,7 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from forcegp.errors import RobotFileError
+from forcegp.errors import RobotFileError, UnsupportedRobotError
 from forcegp.robot.tree import Joint, JointKind, Link, Tree
 
 KINDS: dict[str, JointKind] = {
@@ -73,6 +73,7 @@ def free_mjcf(root: Element, label: str) -> None:
 
     Raises:
         RobotFileError: several bodies could be the base.
+        UnsupportedRobotError: an actuator acts on the free joint.
     """
     worlds = root.findall("worldbody")
     bodies = [body for world in worlds for body in world.findall("body")]
@@ -84,6 +85,10 @@ def free_mjcf(root: Element, label: str) -> None:
         raise _unclear(label, names)
     (body,) = moving
     for joint in _free_joints(body):
+        driven = [e for e in root.iter() if joint.get("name") and e.get("joint") == joint.get("name")]
+        if driven:
+            text = f"{label}: <{driven[0].tag}> acts on the free joint {joint.get('name')!r}"
+            raise UnsupportedRobotError(text, expected="actuators of other joints only", hint="remove it")
         body.remove(joint)
     for name in _POSE:
         body.attrib.pop(name, None)
