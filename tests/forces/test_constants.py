@@ -111,3 +111,16 @@ def test_what_is_not_constant_or_ordered_is_refused() -> None:
         PerRecording(PayloadPrior(), (1, 0))
     with pytest.raises(ModelError, match="standard deviation"):
         DrivePrior(std=0.0)
+
+
+def test_errors_of_scales_include_the_contact_force() -> None:
+    """In contact, M q̈ − Q_K is not the torque of the drives; without contact, it has no torque noise."""
+    system = forcegp.load_scene("kuka_plane").system()
+    robot = system.robot
+    q, qd, tau, qdd = torch.randn(4, 6, robot.nq, dtype=torch.float64)
+    closed = torch.arange(6)[:, None] % 2 == 0
+    at = states(system, q, qd, tau, closed, qdd=qdd)
+    E = DrivePrior(std=0.1, is_error=True).operator(system, at)
+    rigid = dynamics.inverse_dynamics(robot, q, qd, qdd) - dynamics.damping_force(robot, qd)
+    expected = 0.1 * torch.where(closed, tau, rigid)
+    torch.testing.assert_close(E, torch.diag_embed(expected))

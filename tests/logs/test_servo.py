@@ -113,7 +113,7 @@ def test_gains_are_learned_where_links_fix_their_scale(robot: forcegp.RobotModel
         assert scale.std < 0.15
     (said,) = [doubt for doubt in fit.result.warnings if "nominal" in doubt]
     assert said.startswith("torques over the nominal ones")
-    assert said.endswith("links hardly resist: c")
+    assert said.endswith("not determined, and therefore nominal: c")
     last = own["drives.scale of c"]
     assert (last.value, last.std, last.determined) == (0.0, pytest.approx(0.3), False)
     # Relative to the nominal torque of this servo

@@ -281,11 +281,9 @@ def _evaluated(
     if predicted.variance is not None and noise_std is not None:
         spread = Uncertainty.of(predicted.mean, predicted.variance, noise_std, data.qdd, clean)
     residual = predicted.residual
-    acting, train = (
-        None if part is None else replace(part, tau=model.system.robot.true_torque(part.tau))
-        for part in (data, train)
-    )
-    assert acting is not None
+    acting = replace(data, tau=model.system.robot.true_torque(data.tau))
+    if train is not None:
+        train = replace(train, tau=model.system.robot.true_torque(train.tau))
     rest, gravity = beyond_gravity(before, acting) if compare else (None, None)
     scores = () if rest is None else _predictors(model, predicted, spread, before, acting, train, rest)
     real = model if compare and isinstance(model, FittedModel) else None

@@ -83,7 +83,7 @@ def torque_scales(parameters: Sequence[LearnedParameter]) -> tuple[str, ...]:
     rest = [joint for joint, p in found if not p.value]
     sentence = f"torques over the nominal ones [± 2σ]: {', '.join(known) or 'none is determined'}"
     if known and rest:
-        sentence += f"; not determined, since links hardly resist: {', '.join(rest)}"
+        sentence += f"; not determined, and therefore nominal: {', '.join(rest)}"
     return (sentence,)
 
 

@@ -27,8 +27,8 @@ class DrivePrior(ConstantForcePrior):
 
     Args:
         std: relative standard deviation s of the drive constants.
-        spread: standard deviation of each δ_i over blocks of the log, if it was identified together with the
-            inertia.
+        spread: standard deviation of each s δ_i over blocks of the log, if it was identified together with
+            the inertia.
         is_error: whether the robot has the most probable scales, so that their errors have zero mean.
         kernel: covariance of δ.
         name: prefix of the hyperparameters.
@@ -68,8 +68,9 @@ class DrivePrior(ConstantForcePrior):
     def operator(self, system: ConstrainedSystem, at: States) -> Tensor:
         robot, tau = system.robot, at.tau
         if self.is_error and at.qdd is not None:
-            # Noise of τ would favour δ = −1 / s, which leaves nothing of it.
-            tau = (at.eom.M @ at.qdd[..., None])[..., 0] - at.eom.Q_K
+            # Noise of τ favours δ = −1 / s, where nothing of it is left. In contact, τ carries a force too.
+            model = (at.eom.M @ at.qdd[..., None])[..., 0] - at.eom.Q_K
+            tau = torch.where(at.active.any(-1, keepdim=True), tau, model)
         return self.std * robot.joint_torque(torch.diag_embed(robot.drive_torque(tau))).mT
 
 

@@ -484,10 +484,14 @@ static void inertial_errors(const double *q, const double *qd, const double *tau
                             latent *f) {
   (void)q, (void)qd, (void)tau, (void)e, (void)qdd, (void)f;
 #ifdef DRIVES
+  int touches = 0;
+#if CONTACTS > 0
+  for (int c = 0; c < CONTACTS; ++c) touches |= e->closed[c];
+#endif
   memset(f->E[DRIVES], 0, sizeof(double) * NQ * NQ);
   for (int i = 0; i < NQ; ++i) {
     const double known = e->Q_C[i] + e->Q_G[i] + e->Q_D[i];
-    const double torque = DRIVES_MEASURED && qdd ? dot(e->M[i], qdd, NQ) - known : TORQUE_SCALE[i] * tau[i];
+    const double torque = DRIVES_MEASURED && qdd && !touches ? dot(e->M[i], qdd, NQ) - known : TORQUE_SCALE[i] * tau[i];
     f->E[DRIVES + i][i] = DRIVES_STD * torque;
   }
 #endif
