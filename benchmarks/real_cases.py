@@ -86,6 +86,11 @@ def double_pendulum(logs: Path) -> list[Case]:
 
 
 def example_robot(name: str) -> forcegp.RobotModel:
+    """A robot of example-robot-data (see `example_file`)."""
+    return forcegp.load_robot(example_file(name))
+
+
+def example_file(name: str) -> Path:
     """A robot file of example-robot-data, a test dependency.
 
     Raises:
@@ -94,9 +99,7 @@ def example_robot(name: str) -> forcegp.RobotModel:
     spec = find_spec("cmeel")
     if spec is None or spec.origin is None:
         raise DataError(f"{name}: example-robot-data is not installed", hint="pip install example-robot-data")
-    return forcegp.load_robot(
-        existing(Path(spec.origin).parents[1] / "cmeel.prefix/share/example-robot-data/robots" / name)
-    )
+    return existing(Path(spec.origin).parents[1] / "cmeel.prefix/share/example-robot-data/robots" / name)
 
 
 def halved(name: str, robot: forcegp.RobotModel, data: forcegp.Dataset) -> list[Case]:

@@ -107,9 +107,16 @@ TORQUE_NOISE = f"{NOISE}.torque.log_noise_std"
 """Name of the learned motor torque noise."""
 
 
-def initial_torque_noise(residual: Tensor) -> dict[str, Tensor]:
-    """Return the initial torque noise, given the RMS `(nq,)` of the unexplained torque [N m, N]."""
-    std = (0.5 * residual).clamp(min=1e-4).log().double()
+EXACT = 1e-8
+"""Standard deviation of torques that is stored in place of zero [N m, N]."""
+
+
+def initial_torque_noise(residual: Tensor, driven: Tensor) -> dict[str, Tensor]:
+    """Return the initial torque noise, given the RMS `(nq,)` of the unexplained torque [N m, N].
+
+    A free base has no drive, and therefore no torque and no noise.
+    """
+    std = (0.5 * residual).clamp(min=1e-4).where(driven, EXACT).log().double()
     return {
         TORQUE_NOISE: std,
         STICK_NOISE: std.clone(),

@@ -89,7 +89,8 @@ class JointState:
 class PerJointPrior(ForcePrior):
     """A prior on one force per joint with E = I; subclasses may have a different operator.
 
-    Forces of drives have E = Cᵀ, which is the identity unless drives are coupled.
+    Forces of drives have E = Cᵀ, which is the identity unless drives are coupled. The joints of a free base
+    have no drive and no force.
     """
 
     per_joint = True
@@ -104,7 +105,7 @@ class PerJointPrior(ForcePrior):
         return robot.nq
 
     def operator(self, system: ConstrainedSystem, at: States) -> Tensor:
-        E = torch.eye(at.q.shape[-1], dtype=at.q.dtype, device=at.q.device)
+        E = torch.diag(system.robot.driven.to(at.q))
         E = system.robot.joint_torque(E).mT if self.of_drives else E
         return E.expand(len(at.q), -1, -1)
 
@@ -112,7 +113,8 @@ class PerJointPrior(ForcePrior):
         if not self.per_joint:
             return super().applied(B, system, at)
         # B Cᵀ
-        return system.robot.drive_motion(B) if self.of_drives else B
+        B = system.robot.drive_motion(B) if self.of_drives else B
+        return B * system.robot.driven
 
 
 class JointTerm(PerJointPrior):

@@ -113,7 +113,7 @@ def residual_times(
         ]
         noise, white = (torch.cat(part) for part in zip(*parts, strict=True))
         segment, white = m.segment[rows], white.mean(0)
-        logs.append(autocorrelation_time(noise, segment, white).log())
+        logs.append(autocorrelation_time(noise, segment, white)[problem.system.robot.driven].log())
         longest_part = int(segment.unique(return_counts=True)[1].max())
         wanted = round(WINDOW * math.exp(float(logs[-1].mean())))
         length = max(1, min(wanted, len(rows) // WINDOWS, longest_part))

@@ -61,8 +61,10 @@ def calibrated_noise(problem: Problem, hyperparameters: Mapping[str, Tensor]) ->
     # Rounding to steps h has the variance h²/12.
     rounding = torch.from_numpy(resolution(tau.cpu().numpy())).to(tau) / math.sqrt(12.0)
     learned = hyperparameters[TORQUE_NOISE].exp().maximum(rounding)
-    noise = {TORQUE_NOISE: held_out_torque_std(problem, hyperparameters, learned).log()}
-    grows = growth(problem, {**hyperparameters, **noise}, load)
+    driven = problem.system.robot.driven
+    std = held_out_torque_std(problem, hyperparameters, learned).where(driven, learned)
+    noise = {TORQUE_NOISE: std.log()}
+    grows = driven * growth(problem, {**hyperparameters, **noise}, load)
     region = trained_region(qd, tau, load, problem.power * len(qd))
     return {**noise, **region, GROWTH: grows}
 

@@ -174,7 +174,8 @@ def torque_scale(robot: RobotModel, rows: Rows, std: float) -> tuple[Tensor, Ten
     _, found = _regressions(rows, size * torch.diag_embed(rows.qdd), M, std)
     drives, gains = torch.arange(n), torch.arange(n, 2 * n)
     spread = found.read(2 * n, torch.cat([drives, gains]))[1][n:].sqrt()
-    known, every, rejected = spread < UNDETERMINED, found.by_stretch.total(), torch.zeros_like(spread)
+    known = (spread < UNDETERMINED) & robot.driven
+    every, rejected = found.by_stretch.total(), torch.zeros_like(spread)
     while True:
         u = found.estimate(every, torch.cat([drives, gains[known]]), n)[n : 2 * n]
         g = 1.0 + std * u
@@ -436,7 +437,8 @@ def inertia_of(
     """Identify the inertia of a real robot from samples in free motion.
 
     With fewer than `LEAST` such samples, links and drives stay at the robot file. In either case, their
-    remaining errors are unknown.
+    remaining errors are unknown. If the base is free, their posterior mean is learned with all other forces,
+    also from samples in contact: the six equations of the base have no friction and no noise of torques.
 
     Args:
         system: robot and contacts of the robot file.
@@ -449,7 +451,8 @@ def inertia_of(
     if training.free_motions < LEAST:
         size = drive_scale(system.robot, torch.cat([m.q for m in training.measurements]))
         spread = () if scale_std is None else (scale_std,) * system.robot.nq
-        return Inertia(system.robot, _errors(system.robot, size) if links else None, (), spread)
+        unknown = dataclasses.replace(_errors(system.robot, size), is_error=bool(system.robot.driven.all()))
+        return Inertia(system.robot, unknown if links else None, (), spread)
     rows = free_rows(system, friction, mean, training).with_memory()
     rows = with_ripple(system.robot, rows)
     if scale_std is None:
@@ -493,9 +496,9 @@ def drive_scale(robot: RobotModel, q: Tensor) -> Tensor:
     It is the mean inertia of the joint in the robot file, and at least `GEARED` of the largest among joints
     of the same type. A geared drive of a wrist exceeds its links by far (12 to 2500 times on a UR10e).
     """
-    M = inertia_at(robot, q).diagonal(dim1=-2, dim2=-1).mean(0)
+    M = robot.driven * inertia_at(robot, q).diagonal(dim1=-2, dim2=-1).mean(0)
     scale = M.clone()
-    for alike in (robot.revolute > 0.0, robot.revolute == 0.0):
+    for alike in (robot.driven & (robot.revolute > 0.0), robot.driven & (robot.revolute == 0.0)):
         if bool(alike.any()):
             scale[alike] = M[alike].clamp(min=GEARED * float(M[alike].max()))
     return scale

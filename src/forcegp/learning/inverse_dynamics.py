@@ -289,6 +289,7 @@ def _rows(
     at, robot = m.at(system), system.robot
     Phi = torch.cat([*prior.features(system, at).values(), torch.ones_like(at.q)[..., None]], dim=-1)
     Phi, memory = (x / x.square().mean(0).sqrt().clamp(min=1e-12) for x in (Phi, memory))
+    Phi, memory = (robot.driven[:, None] * x for x in (Phi, memory))
     residual = robot.drive_torque(mean(system, at) - (at.eom.M @ m.values[..., None])[..., 0])
     qd, qdd, tau = robot.drive_motion(m.qd), robot.drive_motion(m.values), robot.drive_torque(m.tau)
     weight = rest_weight(qd.abs(), min(prior.speeds), Phi, residual)

@@ -27,7 +27,7 @@ import scipy.optimize
 import torch
 from torch import Tensor
 
-from forcegp.forces.noise import TORQUE_NOISE
+from forcegp.forces.noise import EXACT, TORQUE_NOISE
 from forcegp.forces.posterior import STICK_NOISE, STICK_SPEED, hidden_variance
 from forcegp.forces.priors.base import NOISE
 from forcegp.forces.problem import Problem, Tensors, basis_of, remainder
@@ -51,7 +51,7 @@ ROUNDS, SETTLED, NEGLIGIBLE = 20, 0.02, 1e-3
 STEPS, ACCURACY, DIVISIONS = 50, 1e-3, 16
 """Maximum number of steps of Fisher scoring in one alternation, relative change at which they end, and
 maximum number of times that a step is divided."""
-LEAST_VARIANCE = 1e-16
+LEAST_VARIANCE = EXACT**2
 """Variance of torques that is stored in place of zero [N² m², N²]."""
 AT_REST = (0.02, 0.05, 0.1)
 """Speeds v_s below which a joint or contact is nearly at rest, of which the likeliest is taken [rad/s, m/s]:
@@ -310,7 +310,11 @@ def _with_noise(found: Scales, speeds: Sequence[float]) -> tuple[Tensors, float]
     gamma = determined_by_joint(problem, found.groups, found.evidence)
     share = (1.0 - gamma / (power * len(whole.r))).clamp(min=LEAST_SHARE)
     share = torch.nn.functional.pad(share, (0, len(tips)), value=1.0).repeat(2)
-    stated = Stated(torch.cat(variances(problem, found.stated_noise)), min(power, found.least_power), share)
+    driven = problem.system.robot.driven
+    # The load moves between the feet of a robot with a free base, and so does the size of these forces.
+    known = torch.nn.functional.pad(~driven, (0, len(tips)), value=not bool(driven.all())).repeat(2)
+    variance = torch.cat(variances(problem, found.stated_noise))
+    stated = Stated(variance, min(power, found.least_power), share, known)
     # k = e^{−(v/v_s)²} for other speeds v_s, first of the joints and then of the contacts
     rows, speed, theta = _at_likeliest_speed(
         whole, slice(0, nq), values[STICK_SPEED], speeds or None, theta, stated
@@ -329,11 +333,13 @@ def _with_noise(found: Scales, speeds: Sequence[float]) -> tuple[Tensors, float]
 
 
 class Stated(NamedTuple):
-    """Stated variances θ, the smallest κ, and the share of the samples that determines each θ."""
+    """Stated variances θ, the smallest κ, the share of the samples that determines each θ, and which θ are
+    known, namely those of joints without a drive."""
 
     theta: Tensor
     power: float
     share: Tensor
+    known: Tensor
 
 
 def _at_likeliest_speed(
@@ -351,7 +357,7 @@ def _at_likeliest_speed(
         slow = whole.slow.clone()
         slow[:, own] = slow[:, own] ** (2.0 * (now - speed)).exp()
         rows = whole._replace(slow=slow)
-        free = torch.cat(_independent(rows, stated.power)) >= FEWEST
+        free = (torch.cat(_independent(rows, stated.power)) >= FEWEST) & ~stated.known
         found = _settled(rows, torch.where(free, theta, stated.theta), stated.share, free)
         tried.append((rows.log_density(*found.chunk(2)), rows, speed, found))
     return max(tried, key=lambda each: each[0])[1:]
@@ -434,7 +440,8 @@ def exponent(
         # Bᵀ C⁻² B = D − D S D, since C⁻¹ = 1 − C⁻¹ B S Bᵀ
         white = S * (D.diagonal(dim1=-2, dim2=-1) - (D.square() * S[:, None]).sum(-1))
         signal = (S.sqrt() * a)[:, joints]
-        logs.append(autocorrelation_time(signal, m.segment, white.mean(0)[joints]).log())
+        times = autocorrelation_time(signal, m.segment, white.mean(0)[joints])
+        logs.append(times[problem.system.robot.driven].log())
     return min(1.0, math.exp(-float(torch.stack(logs).mean())))
 
 

@@ -88,7 +88,8 @@ def initial(
     noise, unseen = {}, UNSHOWN * few.typical_load() if automatic else None
     if learn_torque_noise:
         closed = (m.at(few.system) for m in few.training.measurements)
-        noise = initial_torque_noise(few.torque_residual()) | stated_tips(few.system, closed)
+        noise = initial_torque_noise(few.torque_residual(), few.system.robot.driven)
+        noise |= stated_tips(few.system, closed)
     if problem.has_coulomb:
         start = _with_friction(few, noise, unseen)
     else:

@@ -134,7 +134,8 @@ class Specification:
         if friction is None or not asks or any(isinstance(prior, InertialPrior) for prior in self.priors):
             return Inertia(self.system.robot)
         found = inertia_of(self.system, friction, self.mean, training, scale, links)
-        return found if training.free_motions >= LEAST else replace(found, doubts=_unchecked_masses(training))
+        checked = training.free_motions >= LEAST or not bool(self.system.robot.driven.all())
+        return found if checked else replace(found, doubts=_unchecked_masses(training))
 
     def problem(self, training: Training, robot: RobotModel | None = None) -> Problem:
         """Return the learning problem for training data.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol, runtime_checkable
 
@@ -189,37 +189,33 @@ def external_wrench(
 def contact_force(
     fit: LearnedForces, data: Dataset, contact: str | None, prior_std: tuple[float, float] | None
 ) -> Prediction:
-    """Return the force of a contact at each sample of a log, as in `StructuredFit.contact_force`."""
-    name = surface_contact(fit.system, contact).name
-    own = ContactUnknown(name, prior_std)
-    mean, covariance = Reading.of(fit, data, own, None).from_accelerations()
-    open_ = ~data.active((name,))[:, 0]
-    mean = mean.masked_fill(open_[:, None], 0.0)
-    covariance = covariance.masked_fill(open_[:, None, None], 0.0)
-    beyond, joints = fit.beyond(data.qd, data.tau), fit.system.robot.joint_names
-    return Prediction(mean, covariance, {"contact_force": slice(0, AXES)}, beyond, joints)
+    """Return the forces of contacts at each sample of a log, as in `StructuredFit.contact_force`."""
+    names = surface_contacts(fit.system, contact)
+    mean, covariance = Reading.of(fit, data, ContactUnknown(names, prior_std), None).from_accelerations()
+    read = names if contact is None else names[:1]
+    closed = data.active(read).repeat_interleave(AXES, dim=-1)
+    mean, covariance = mean[:, : closed.shape[-1]], covariance[:, : closed.shape[-1], : closed.shape[-1]]
+    mean, covariance = mean * closed, covariance * closed[:, None] * closed[..., None]
+    parts = {name: slice(AXES * k, AXES * (k + 1)) for k, name in enumerate(read)}
+    parts = {"contact_force": slice(0, AXES)} if len(read) == 1 else parts
+    return Prediction(mean, covariance, parts, fit.beyond(data.qd, data.tau), fit.system.robot.joint_names)
 
 
-def surface_contact(system: ConstrainedSystem, name: str | None) -> SurfaceContact:
-    """Return the named surface contact, or the only one.
+def surface_contacts(system: ConstrainedSystem, first: str | None) -> tuple[str, ...]:
+    """Return the names of all surface contacts, beginning with the given one.
 
     Raises:
         UnknownNameError: the contact does not exist.
-        ModelError: no contact is named and there is not exactly one, or it has no surface.
+        ModelError: the contact has no surface, or no contact has one.
     """
-    if name is None:
-        if len(system.contacts) != 1:
-            raise ModelError(
-                "the contact must be named",
-                expected="one of " + ", ".join(system.contact_names) or "a contact",
-            )
-        name = system.contact_names[0]
-    contact = system.contact(name)
-    if not isinstance(contact, SurfaceContact):
-        raise ModelError(
-            f"contact {name!r} has no surface", expected="a SurfaceContact", got=type(contact).__name__
-        )
-    return contact
+    if first is not None and not isinstance(contact := system.contact(first), SurfaceContact):
+        text = f"contact {first!r} has no surface"
+        raise ModelError(text, expected="a SurfaceContact", got=type(contact).__name__)
+    names = [each.name for each in system.contacts if isinstance(each, SurfaceContact)]
+    if not names:
+        text = "the system has no contact with a surface"
+        raise ModelError(text, expected="a SurfaceContact", got=", ".join(system.contact_names) or "none")
+    return tuple(sorted(names, key=lambda name: name != first))
 
 
 class Unknown(NamedTuple):
@@ -247,30 +243,40 @@ class Unknown(NamedTuple):
 
 @dataclass(frozen=True)
 class ContactUnknown:
-    """The force at a closed surface contact, F = λ (n − μ s(v)) + F_z + u (`StructuredFit.contact_force`).
+    """Forces at closed surface contacts, F = λ (n − μ s(v)) + F_z + u (`StructuredFit.contact_force`).
+
+    All contacts of a system are unknown, as λ of one depends on the others.
 
     Attributes:
-        contact: name of the contact.
+        contacts: names of the contacts.
         prior_std: prior standard deviations of λ and u [N], or `None` for a free λ and the learned size of u.
     """
 
-    contact: str
+    contacts: tuple[str, ...]
     prior_std: tuple[float, float] | None = None
 
     def separated(self, posterior: ForcePosterior) -> ForcePosterior:
-        """Return the posterior without Coulomb friction at this contact, which is proportional to λ."""
-        coulomb = tuple(law for law in posterior.process.coulomb if law.contact != self.contact)
+        """Return the posterior without Coulomb friction at these contacts, which is proportional to λ."""
+        coulomb = tuple(law for law in posterior.process.coulomb if law.contact not in self.contacts)
         return dataclasses.replace(posterior, process=dataclasses.replace(posterior.process, coulomb=coulomb))
 
-    def unknown(self, fit: LearnedForces, at: States, friction: tuple[Tensor, Tensor]) -> Unknown:
-        """Return the unknown force, given the mean and covariance of J_EᵀF_z."""
-        point = at.eom.contact_points[self.contact]
+    def unknown(
+        self, fit: LearnedForces, at: States, friction: Callable[[str], tuple[Tensor, Tensor]]
+    ) -> Unknown:
+        """Return the unknown forces `(n, 3 c)`, given the mean and covariance of J_EᵀF_z of each contact."""
+        each = [self._at(name, fit, at, friction(name)) for name in self.contacts]
+        J, prior, offset, directions = zip(*each, strict=True)
+        blocks = [torch.block_diag(*row) for row in zip(*(D.unbind() for D in directions), strict=True)]
+        return Unknown(torch.cat(J, dim=-2), torch.cat(prior), torch.cat(offset, dim=-1), torch.stack(blocks))
+
+    def _at(self, name: str, fit: LearnedForces, at: States, friction: tuple[Tensor, Tensor]) -> Unknown:
+        point, closed = at.eom.contact_points[name], at.active[:, fit.system.contact_names.index(name)]
         n, v, t = point.unit_normal, point.sliding[1], tangent_frame(point.unit_normal)
         normal, s = self.prior_std or (MULTIPLIER_STD, FORCE_STD)
-        if self.prior_std is None and tip_keys(self.contact).rests in fit.hyperparameters:
-            variance = tip_variance(fit.hyperparameters, at, self.contact)
+        if self.prior_std is None and tip_keys(name).rests in fit.hyperparameters:
+            variance = tip_variance(fit.hyperparameters, at, name)
         else:
-            variance = s**2 * share_at_rest(fit.hyperparameters, at, self.contact)
+            variance = s**2 * share_at_rest(fit.hyperparameters, at, name)
         # F_z + u in the tangent frame, with the covariance R Rᵀ
         to_tangent = torch.linalg.pinv((t.mT @ point.jacobian).mT)
         mean, covariance = friction
@@ -279,12 +285,14 @@ class ContactUnknown:
         # n − μ s(v)
         direction = n
         for law in fit.posterior.process.coulomb:
-            if law.contact == self.contact:
+            if law.contact == name:
                 size = (v.square().sum(-1, keepdim=True) + law.smoothing**2).sqrt()
                 direction = direction - law.coefficient * v / size
         offset = (t @ (to_tangent @ mean[..., None]))[..., 0]
         directions = torch.cat([direction[..., None], t @ R], dim=-1)
-        return Unknown(point.jacobian, n.new_tensor([normal, 1.0, 1.0]), offset, directions)
+        return Unknown(
+            closed[:, None, None] * point.jacobian, n.new_tensor([normal, 1.0, 1.0]), offset, directions
+        )
 
 
 class JointForces(NamedTuple):
@@ -358,25 +366,25 @@ class Reading:
             mean, S = posterior.read(system, at, z)
             S = S + _of_tips(posterior, values, system, at, z)
             return mean, S, Unknown(J, self.source.prior.to(at.q)), A
-        contact = self.source.contact
-        posterior = self.source.separated(posterior)
-        values = {key: x for key, x in values.items() if key not in tip_keys(contact)}
-        own = [getattr(prior, "contact", None) == contact for prior in posterior.priors]
+        names, posterior = self.source.contacts, self.source.separated(posterior)
+        values = {key: x for key, x in values.items() if not any(key in tip_keys(name) for name in names)}
+        owners = [getattr(prior, "contact", None) for prior in posterior.priors]
         rows = posterior.rows(system, at, z)
 
-        def part(keep: bool) -> tuple[Tensor, Tensor]:
-            pairs = zip(own, rows.operators, strict=True)
-            chosen = tuple(W if mine is keep else torch.zeros_like(W) for mine, W in pairs)
+        def part(includes: Callable[[str | None], bool]) -> tuple[Tensor, Tensor]:
+            pairs = zip(owners, rows.operators, strict=True)
+            chosen = tuple(W if includes(owner) else torch.zeros_like(W) for owner, W in pairs)
             block = dataclasses.replace(rows, operators=chosen)
             return posterior.latent.mean(block), posterior.latent.covariance(block)
 
-        force = self.source.unknown(self.fit, at, part(True))
-        mean, S = part(False)
+        force = self.source.unknown(self.fit, at, lambda name: part(lambda owner: owner == name))
+        mean, S = part(lambda owner: owner not in names)
         mean = mean + rows.target
         if force.offset is not None:
             mean = mean + (force.J.mT @ force.offset[..., None])[..., 0]
         others = torch.ones(A.shape[-2], dtype=torch.bool)
-        others[system.rows[contact]] = False
+        for name in names:
+            others[system.rows[name]] = False
         S = S + _of_tips(posterior, values, system, at, z)
         return mean, S, force, A[:, others.to(A.device)]
 

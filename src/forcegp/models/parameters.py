@@ -130,6 +130,8 @@ def _of_prior(
         if len(names) > len(scale):
             unit = torch.cat([unit, prior.kernel.bias_std(params)[:, None]], dim=-1)
         for j, joint in enumerate(robot.joint_names):
+            if not robot.driven[j]:
+                continue
             kind = int(robot.joint_types[j] != "revolute")
             for c, name in enumerate(names):
                 units = UNITS.get(name, ("N m", "N"))[kind]
@@ -153,6 +155,8 @@ def _of_prior(
             of_scales = (std.new_tensor(prior.per_gain) * std.new_tensor(spread)).norm(dim=-1)
             std = torch.maximum(std, (of_scales / (sizes * prior.kernel.std(params)))[:, None])
         for k, unit in enumerate(sizes * prior.kernel.std(params)):
+            if not unit > 0.0:
+                continue  # a link without mass, or a joint without a drive
             link, index = divmod(k, len(PARAMETER_NAMES))
             name, units = PARAMETER_NAMES[index], INERTIAL[index]
             if isinstance(prior, PayloadPrior):

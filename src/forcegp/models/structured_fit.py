@@ -252,25 +252,26 @@ class StructuredFit(FittedModel):
     def contact_force(
         self, data: Dataset, contact: str | None = None, *, prior_std: tuple[float, float] | None = None
     ) -> Prediction:
-        """Estimate the force on the robot at a closed contact along a log, from the measured accelerations.
+        """Estimate the forces on the robot at closed contacts along a log, from the measured accelerations.
 
-        The force F = λ (n − μ s(v)) + F_z + u acts in addition to the learned joint forces: M q̈ = Q + J_EᵀF.
+        Forces F = λ (n − μ s(v)) + F_z + u act in addition to the learned joint forces: M q̈ = Q + Σ J_EᵀF.
         Coulomb friction μ and other friction F_z at the contact are those of the fit. The tangential force u
         of a contact at rest is unknown. λ and u are estimated by generalized least squares, as is an external
         wrench (`forces/external_wrench.py`). `predict` does without accelerations and is less accurate.
 
         Args:
             data: a log with accelerations. Friction with memory is included if it is in time order.
-            contact: the name of a surface contact. It can be omitted if there is only one.
+            contact: the name of a surface contact; by default, the forces of all of them are returned.
             prior_std: prior standard deviations of the normal force and of the tangential force at rest [N].
                 By default, the normal force is free, and the tangential force has the learned size.
 
         Returns:
-            The mean `(n, 3)` and covariance `(n, 3, 3)` in world axes [N], both zero for an open contact.
+            The mean `(n, 3 c)` and covariance `(n, 3 c, 3 c)` of c contacts in world axes [N], both zero for
+            open contacts. With several contacts, `parts` has the slice of each.
 
         Raises:
             UnknownNameError: the contact does not exist.
-            ModelError: no contact is named and there are several, or the contact has no surface.
+            ModelError: the contact has no surface, or no contact has one.
             DataError: the log does not match the robot.
 
         Example:

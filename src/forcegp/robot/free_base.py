@@ -13,18 +13,12 @@ from xml.etree.ElementTree import Element
 import numpy as np
 
 from forcegp.errors import RobotFileError, UnsupportedRobotError
+from forcegp.robot.model import BASE_JOINTS
 from forcegp.robot.tree import Joint, JointKind, Link, Tree
 
 KINDS: dict[str, JointKind] = {
-    "base_x": "prismatic",
-    "base_y": "prismatic",
-    "base_z": "prismatic",
-    "base_yaw": "revolute",
-    "base_pitch": "revolute",
-    "base_roll": "revolute",
+    name: "revolute" if k >= 3 else "prismatic" for k, name in enumerate(BASE_JOINTS)
 }
-BASE_JOINTS = tuple(KINDS)
-"""Names of the joints, in order."""
 _AXES = ("1 0 0", "0 1 0", "0 0 1", "0 0 1", "0 1 0", "1 0 0")
 WORLD = "world"
 """Name of the fixed world."""

@@ -21,6 +21,8 @@ from forcegp.errors import ParameterError, ShapeError, UnsupportedRobotError, ch
 from forcegp.notebook import html_table
 
 JointType = Literal["revolute", "prismatic"]
+BASE_JOINTS = ("base_x", "base_y", "base_z", "base_yaw", "base_pitch", "base_roll")
+"""Names of the joints of a free base, in order (`free_base.py`)."""
 BASE = -1
 """Joint index that denotes the fixed base."""
 
@@ -144,6 +146,12 @@ class RobotModel:
         """Vector `(nq,)` that is 1 for revolute joints and 0 for prismatic joints."""
         flags = [float(kind == "revolute") for kind in self.joint_types]
         return torch.tensor(flags, dtype=self.dtype, device=self.device)
+
+    @cached_property
+    def driven(self) -> Tensor:
+        """Mask `(nq,)` of the joints with a drive, which those of a free base do not have."""
+        flags = [joint not in BASE_JOINTS for joint in self.joint_names]
+        return torch.tensor(flags, device=self.device)
 
     @cached_property
     def fingerprint(self) -> str:

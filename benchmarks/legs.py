@@ -1,0 +1,504 @@
+"""Feet of legged robots that MuJoCo moves: forces along the log, learned on one gait and tested on another.
+
+    python benchmarks/legs.py --json legs.json            # two robots, two frictions, two seeds
+    python benchmarks/legs.py --robot solo12 --friction coulomb --seeds 0
+
+The true robot has joint friction, a payload of a tenth of its mass on the trunk, and links that differ from
+the file by 5 %. Torques, encoders and the IMU are noisy. Training logs hold standing, swaying and a trot;
+the test is a walk. The force of each foot along the log is compared with the engine's.
+
+- `legs`: −J⁻ᵀτ of each leg by itself, with gravity and motion of the leg's links ignored.
+- `equations of motion`: M q̈ − Q_K − τ = Σ JᵀF with the file, by generalized least squares.
+- `identified`: the same with friction, trunk and links by least squares from the training log.
+- `forcegp`: `contact_force` of a default fit.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import json
+import re
+import time
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from real_cases import example_file
+from results_page import table
+from scipy.spatial.transform import Rotation
+
+import forcegp
+from forcegp.errors import optional_module
+from forcegp.kinematics import frame_jacobian
+
+mujoco = optional_module("mujoco", "This benchmark")
+Array = NDArray[np.float64]
+DISTANCE = 0.02
+"""Over which Dahl's friction develops [rad]."""
+STEP, RATE = 0.0005, 500
+"""Time step of the engine [s] and rate of the log [Hz]."""
+SECONDS = {"train": 20.0, "test": 10.0}
+EVERY, TESTED = 5, 5
+"""Every so many rows are learned from, and tested."""
+LINKS, PAYLOAD = 0.05, 0.1
+"""Relative errors of links, and payload of the trunk over the mass of the robot."""
+GYRO, ACCELEROMETER = 4e-3, 0.03
+"""White noise of the IMU at 500 Hz [rad/s, m/s²], of 2.4e-4 rad/s/√Hz and 1.7e-3 m/s²/√Hz as in the data
+sheet of the Bosch BMI088."""
+TURNING, TORQUE = 2.0, 0.005
+"""White noise of accelerations from differences of encoders and of the gyro [rad/s²], and of torques over the
+largest torque."""
+METHODS = ("legs", "equations of motion", "identified", "forcegp")
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A legged robot of example-robot-data: its file, frames of the feet, radius of a foot [m], angles
+    of joints while standing, stiffness of servos [N m/rad], height of a step [m], inertia of drives."""
+
+    path: str
+    feet: tuple[str, ...]
+    radius: float
+    stand: dict[str, float]
+    stiffness: float
+    lift: float
+    drive: float
+
+
+ROBOTS = {
+    "solo12": Kind(
+        "solo_description/robots/solo12.urdf",
+        ("FL_FOOT", "FR_FOOT", "HL_FOOT", "HR_FOOT"),
+        0.016,
+        {"F._HFE": 0.8, "F._KFE": -1.6, "H._HFE": -0.8, "H._KFE": 1.6},
+        8.0,
+        0.04,
+        5e-4,
+    ),
+    "a1": Kind(
+        "a1_description/urdf/a1.urdf",
+        ("FL_foot", "FR_foot", "RL_foot", "RR_foot"),
+        0.02,
+        {".*thigh.*": 0.8, ".*calf.*": -1.6},
+        120.0,
+        0.04,
+        8e-3,
+    ),
+}
+
+
+class Legged:
+    """A legged robot in MuJoCo that differs from its file, and the servos that make it walk."""
+
+    def __init__(self, name: str, friction: str, seed: int) -> None:
+        self.kind, self.random = ROBOTS[name], np.random.default_rng(seed)
+        self.path = example_file(self.kind.path)
+        self.robot = forcegp.load_robot(self.path, base="free")
+        self.names = self.robot.joint_names[6:]
+        self.nominal, self.true = self._model(), self._model()
+        model, random = self.true, self.random
+        total = model.body_mass.sum()
+        factor = 1.0 + LINKS * random.uniform(-1.0, 1.0, model.nbody)
+        model.body_mass[:] *= factor
+        model.body_inertia[:] *= factor[:, None]
+        self.payload = PAYLOAD * total
+        self.dof = np.array([model.joint(joint).dofadr[0] for joint in self.names])
+        self.at = self.dof + 1
+        self.base = int(model.jnt_bodyid[0])
+        self.trunk = trunk = int(np.argmax(model.body_mass))
+        self.place = random.uniform(-0.1, 0.1, 3) * (1.0, 0.5, 0.3)
+        _add_mass(model, trunk, self.payload, self.place)
+        load = self.kind.stiffness * 0.1
+        n = len(self.names)
+        model.dof_armature[self.dof] = self.kind.drive * random.uniform(0.5, 1.5, n)
+        self.dry = np.zeros(model.nv)
+        self.dry[self.dof] = 0.08 * load * random.uniform(0.5, 1.5, n)
+        model.dof_damping[self.dof] = 0.02 * load * random.uniform(0.5, 1.5, n)
+        self.friction = friction
+        if friction == "coulomb":
+            model.dof_frictionloss[:] = self.dry
+        self.feet = [model.body(foot).id for foot in self.kind.feet]
+        mujoco.mj_setConst(model, mujoco.MjData(model))
+        self.stand = self._standing()
+
+    def _model(self) -> Any:
+        """The file as MuJoCo reads it, with a free base, balls for feet, and a floor."""
+        root = ElementTree.parse(self.path).getroot()
+        for link in root.findall("link"):
+            for shape in (*link.findall("visual"), *link.findall("collision")):
+                link.remove(shape)
+        extension = ElementTree.SubElement(root, "mujoco")
+        ElementTree.SubElement(extension, "compiler", fusestatic="false")
+        spec = mujoco.MjSpec.from_string(ElementTree.tostring(root, encoding="unicode"))
+        spec.worldbody.first_body().add_freejoint()
+        floor = {"solref": [0.005, 1.0], "friction": [0.8, 0.005, 0.0001]}
+        spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[20.0, 20.0, 0.1], **floor)
+        for foot in self.kind.feet:
+            spec.body(foot).add_geom(
+                type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[self.kind.radius, 0, 0], mass=0.0, **floor
+            )
+        spec.option.timestep = STEP
+        spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+        spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+        spec.option.impratio = 10.0
+        return spec.compile()
+
+    def _standing(self) -> Array:
+        """Angles of the joints while standing."""
+        q = np.zeros(len(self.names))
+        for pattern, angle in self.kind.stand.items():
+            q[[re.match(pattern, name) is not None for name in self.names]] = angle
+        return q
+
+    def angles(self, wanted: Callable[[float], Array], times: Array) -> Array:
+        """Angles `(n, joints)` that place the feet at wanted positions `(feet, 3)` in axes of the trunk."""
+        model, q, rows = self.nominal, self.stand.copy(), []
+        data = mujoco.MjData(model)
+        J = np.zeros((3, model.nv))
+        for t in times:
+            for _ in range(3):
+                data.qpos[:] = [0, 0, 0, 1, 0, 0, 0, *np.zeros(len(q))]
+                data.qpos[self.at] = q
+                mujoco.mj_kinematics(model, data)
+                mujoco.mj_comPos(model, data)
+                A, e = [], []
+                for foot, place in zip(self.feet, wanted(t), strict=True):
+                    mujoco.mj_jacBody(model, data, J, None, foot)
+                    A.append(J[:, self.dof].copy())
+                    e.append(place - data.xpos[foot])
+                q = q + np.linalg.lstsq(np.concatenate(A), np.concatenate(e), rcond=1e-3)[0]
+            rows.append(q.copy())
+        return np.array(rows)
+
+    def standing_feet(self) -> Array:
+        """Positions of the feet `(feet, 3)` in axes of the trunk while standing."""
+        data = mujoco.MjData(self.nominal)
+        data.qpos[:] = [0, 0, 0, 1, 0, 0, 0, *np.zeros(len(self.names))]
+        data.qpos[self.at] = self.stand
+        mujoco.mj_kinematics(self.nominal, data)
+        return data.xpos[self.feet].copy()
+
+    def steps(self, phases: Array, duty: float, hertz: float, stride: Array) -> Callable[[float], Array]:
+        """A gait in which each foot stands for a share `duty` of the period."""
+        home = self.standing_feet()
+
+        def wanted(t: float) -> Array:
+            ramp = min(1.0, t)
+            phase = (hertz * t + phases) % 1.0
+            swing = np.clip((phase - duty) / (1.0 - duty), 0.0, 1.0)
+            along = np.where(phase < duty, 0.5 - phase / duty, smooth(swing) - 0.5)
+            up = self.kind.lift * np.sin(np.pi * swing) ** 2
+            return home + ramp * (along[:, None] * stride + up[:, None] * (0.0, 0.0, 1.0))
+
+        return wanted
+
+    def pushed(self) -> Callable[[float], Array]:
+        """Half sines of up to a fifth of the weight in random directions, each for half a second."""
+        size = 0.2 * 9.81 * self.true.body_mass.sum()
+        forces = size * self.random.uniform(-1.0, 1.0, (100, 3)) / np.sqrt(3.0)
+
+        def push(t: float) -> Array:
+            return forces[int(t)] * np.sin(2.0 * np.pi * (t % 1.0)) * (t % 1.0 < 0.5)
+
+        return push
+
+    def sway(self) -> Callable[[float], Array]:
+        """The trunk moves in all six directions."""
+        home = self.standing_feet()
+        height = -home[:, 2].mean()
+        w = 2.0 * np.pi * self.random.uniform(0.4, 1.5, 6)
+
+        def wanted(t: float) -> Array:
+            s = min(1.0, t) * np.sin(w * t) * (0.1, 0.08, 0.12, 0.1, 0.12, 0.15) * np.repeat((height, 1.0), 3)
+            return Rotation.from_euler("xyz", s[3:]).apply(home) + s[:3]
+
+        return wanted
+
+    def record(
+        self, wanted: Callable[[float], Array], seconds: float, push: Callable[[float], Array] | None = None
+    ) -> dict[str, Array]:
+        """Rows of a log under servos, with exact states, torques and forces of the feet.
+
+        Args:
+            push: force on the centre of mass of the trunk `(3,)` over time [N].
+        """
+        model, data = self.true, mujoco.MjData(self.true)
+        every, n = round(1.0 / STEP / RATE), len(self.names)
+        times = np.arange(round(seconds * RATE)) / RATE
+        targets = self.angles(wanted, times)
+        data.qpos[:] = [0, 0, -self.standing_feet()[:, 2].min() + self.kind.radius, 1, 0, 0, 0, *np.zeros(n)]
+        data.qpos[self.at] = targets[0]
+        rows: dict[str, list[Array]] = {key: [] for key in ("q", "qd", "qdd", "tau", "force")}
+        k_p = self.kind.stiffness
+        k_d = 0.03 * k_p
+        bristles = Dahl(self.dry) if self.friction == "dahl" else None
+        mujoco.set_mjcb_passive(bristles)
+        for k, target in enumerate(targets):
+            speed = (target - targets[max(0, k - 1)]) * RATE
+            tau = k_p * (target - data.qpos[self.at]) + k_d * (speed - data.qvel[self.dof])
+            data.qfrc_applied[self.dof] = tau
+            if push is not None:
+                data.xfrc_applied[self.trunk, :3] = push(times[k])
+            mujoco.mj_forward(model, data)
+            rows["q"].append(data.qpos.copy())
+            rows["qd"].append(data.qvel.copy())
+            rows["qdd"].append(data.qacc.copy())
+            rows["tau"].append(tau)
+            rows["force"].append(self._forces(data))
+            for _ in range(every):
+                mujoco.mj_step(model, data)
+        mujoco.set_mjcb_passive(None)
+        return {"t": times} | {key: np.array(value) for key, value in rows.items()}
+
+    def _forces(self, data: Any) -> Array:
+        """Forces of the floor on the feet `(feet, 3)` in world axes."""
+        forces, wrench = np.zeros((len(self.feet), 3)), np.zeros(6)
+        for i, contact in enumerate(data.contact):
+            mujoco.mj_contactForce(self.true, data, i, wrench)
+            body = int(self.true.geom_bodyid[contact.geom2])
+            forces[self.feet.index(body)] += contact.frame.reshape(3, 3).T @ wrench[:3]
+        return forces
+
+
+def smooth(s: Array) -> Array:
+    """From 0 to 1 without a jump of the velocity."""
+    return s * s * (3.0 - 2.0 * s)
+
+
+class Dahl:
+    """Dry friction with memory as a callback of MuJoCo."""
+
+    def __init__(self, dry: Array) -> None:
+        self.dry, self.bristle, self.time = dry, np.zeros(len(dry)), 0.0
+
+    def __call__(self, model: Any, data: Any) -> None:
+        """Add the force; the bristles move on with the time of the engine."""
+        speed = data.qvel
+        end = np.sign(speed)
+        change = np.exp(-np.abs(speed) * (data.time - self.time) / DISTANCE)
+        self.bristle, self.time = end + (self.bristle - end) * change, data.time
+        data.qfrc_passive -= self.dry * self.bristle
+
+
+def _add_mass(model: Any, body: int, mass: float, place: Array) -> None:
+    """Add a point mass at a place [m] in axes of a body."""
+    m, c = float(model.body_mass[body]), model.body_ipos[body].copy()
+    R = np.zeros(9)
+    mujoco.mju_quat2Mat(R, model.body_iquat[body])
+    R = R.reshape(3, 3)
+    com = (m * c + mass * place) / (m + mass)
+    inertia = R @ np.diag(model.body_inertia[body]) @ R.T
+    for weight, at in ((m, c), (mass, place)):
+        d = at - com
+        inertia += weight * (d @ d * np.eye(3) - np.outer(d, d))
+    moments, axes = np.linalg.eigh(inertia)
+    axes[:, 0] *= np.linalg.det(axes)
+    model.body_mass[body], model.body_ipos[body], model.body_inertia[body] = m + mass, com, moments
+    mujoco.mju_mat2Quat(model.body_iquat[body], axes.flatten())
+
+
+def euler(quat: Array) -> Array:
+    """Yaw, pitch and roll `(n, 3)` of quaternions (w, x, y, z)."""
+    angles = Rotation.from_quat(np.roll(quat, -1, axis=1)).as_euler("ZYX")
+    return np.unwrap(angles, axis=0)
+
+
+def rates(angles: Array, spin: Array) -> Array:
+    """Rates of yaw, pitch and roll `(n, 3)` from the angular velocity in axes of the body."""
+    pitch, roll = angles[:, 1], angles[:, 2]
+    turned = np.cos(roll) * spin[:, 1] - np.sin(roll) * spin[:, 2]
+    yaw = (np.sin(roll) * spin[:, 1] + np.cos(roll) * spin[:, 2]) / np.cos(pitch)
+    return np.stack([yaw, turned, spin[:, 0] + np.sin(pitch) * yaw], axis=1)
+
+
+def accelerations(angles: Array, speeds: Array, spin: Array, change: Array) -> Array:
+    """Second derivatives of yaw, pitch and roll from ω̇ in axes of the body."""
+    h = 1e-6
+    # d/dt of rates(angles, ω) = rates(angles, ω̇) + ∂rates/∂angles · speeds
+    moved = (rates(angles + h * speeds, spin) - rates(angles - h * speeds, spin)) / (2.0 * h)
+    return rates(angles, change) + moved
+
+
+def dataset(legged: Legged, rows: dict[str, Array]) -> forcegp.Dataset:
+    """The log with noise, with the base as six joints."""
+    random = legged.random
+
+    def noisy(x: Array, std: float) -> Array:
+        return x + std * random.standard_normal(x.shape)
+
+    angles, spin = euler(rows["q"][:, 3:7]), rows["qd"][:, 3:6]
+    speeds = rates(angles, noisy(spin, GYRO))
+    turning = accelerations(angles, speeds, spin, noisy(rows["qdd"][:, 3:6], TURNING))
+    q = np.concatenate([rows["q"][:, :3], angles, rows["q"][:, legged.at]], axis=1)
+    qd = np.concatenate([rows["qd"][:, :3], speeds, rows["qd"][:, legged.dof]], axis=1)
+    linear = noisy(rows["qdd"][:, :3], ACCELEROMETER)
+    qdd = np.concatenate([linear, turning, noisy(rows["qdd"][:, legged.dof], TURNING)], axis=1)
+    tau = noisy(rows["tau"], TORQUE * np.abs(rows["tau"]).max())
+    tau = np.concatenate([np.zeros((len(tau), 6)), tau], axis=1)
+    force = {foot: torch.from_numpy(rows["force"][:, k].copy()) for k, foot in enumerate(legged.kind.feet)}
+    contact = {foot: F.norm(dim=-1) > 0.0 for foot, F in force.items()}
+    columns = (torch.from_numpy(x.copy()) for x in (rows["t"], q, qd, tau, qdd))
+    extras = {"F": force}
+    return forcegp.Dataset(*columns, legged.robot.joint_names, contact=contact, contact_extras=extras)
+
+
+class Plain:
+    """Equations of motion with unknown forces of all closed feet, by generalized least squares.
+
+    M q̈ − Q_K − τ = Σ JᵀF + e with e ~ N(0, S). S holds torques of the joints, whose unknown part is that of
+    the training log, and the noise of q̈. `identified` adds columns of viscous and dry friction, offsets and
+    drives of the joints, and of the ten parameters of the trunk.
+    """
+
+    def __init__(self, system: forcegp.ConstrainedSystem, train: forcegp.Dataset, identifies: bool) -> None:
+        self.system, self.identifies = system, identifies
+        self.sigma = torch.full((system.robot.nq - 6,), 0.1, dtype=train.dtype)
+        self.weights = torch.zeros(0, dtype=train.dtype)
+        for _ in range(3):
+            J, r, L, X = self._rows(train)
+            # U spans what forces of the feet leave, Uᵀ L⁻¹ Jᵀ = 0
+            B, e = (torch.linalg.solve_triangular(L, x, upper=False) for x in (J.mT, r[..., None]))
+            X = torch.linalg.solve_triangular(L, X, upper=False)
+            P = torch.eye(B.shape[-2]).to(B) - B @ torch.linalg.pinv(B, rtol=1e-9)
+            e, X = P @ e, P @ X
+            if identifies:
+                size = X.square().mean((0, 1)).sqrt().clamp(min=1e-12)
+                A = (X / size).flatten(0, 1)
+                gram = A.mT @ A + 1e-8 * len(A) * torch.eye(A.shape[-1]).to(A)
+                self.weights = torch.linalg.solve(gram, A.mT @ e.flatten(0, 1))[:, 0] / size
+                e = e - X @ self.weights[:, None]
+            left = (L @ e)[:, 6:, 0]
+            share = P.diagonal(dim1=-2, dim2=-1)[:, 6:].mean(0)
+            self.sigma = (left.square().mean(0) / share).sqrt()
+
+    def _rows(self, data: forcegp.Dataset) -> tuple[torch.Tensor, ...]:
+        eom, n = self.system.equations(data.q, data.qd), data.nq
+        feet = self.system.contact_names
+        J = torch.cat([eom.contact_points[f].jacobian * data.contact[f][:, None, None] for f in feet], dim=1)
+        r = (eom.M @ data.qdd[..., None])[..., 0] - eom.Q_K - data.tau
+        noise = torch.cat([torch.full((3,), ACCELEROMETER), torch.full((n - 3,), TURNING)]).to(r)
+        S = (eom.M * noise**2) @ eom.M.mT
+        S = S + torch.diag_embed(torch.nn.functional.pad(self.sigma**2, (6, 0), value=1e-12))
+        dry = torch.tanh(data.qd / 0.02)
+        each = [torch.diag_embed(x)[..., 6:] for x in (data.qd, dry, torch.ones_like(dry), data.qdd)]
+        Y = forcegp.identification.regressor(self.system.robot, data.q, data.qd, data.qdd)
+        X = -torch.cat([*each, Y[..., 50:60]], dim=-1)
+        return J, r, torch.linalg.cholesky(S), X
+
+    def forces(
+        self, data: forcegp.Dataset, trunk: tuple[str, tuple[float, ...]] | None = None
+    ) -> dict[str, torch.Tensor]:
+        """Forces of the feet, and on a point of the trunk, `(n, 3)`."""
+        J, r, L, X = self._rows(data)
+        if trunk is not None:
+            J = torch.cat([J, frame_jacobian(self.system.robot, data.q, *trunk)[:, 3:]], dim=1)
+        r = r - (X @ self.weights) if self.identifies else r
+        B, e = (torch.linalg.solve_triangular(L, x, upper=False) for x in (J.mT, r[..., None]))
+        F = (torch.linalg.pinv(B, rtol=1e-9) @ e)[..., 0]
+        names = (*self.system.contact_names, *(["trunk"] if trunk else []))
+        return {name: F[:, 3 * k : 3 * k + 3] for k, name in enumerate(names)}
+
+
+def of_legs(system: forcegp.ConstrainedSystem, data: forcegp.Dataset) -> dict[str, torch.Tensor]:
+    """−J⁻ᵀ τ of each leg."""
+    eom, own = system.equations(data.q, data.qd), {}
+    for foot in system.contact_names:
+        J = eom.contact_points[foot].jacobian[..., 6:]
+        own[foot] = torch.linalg.lstsq(J.mT, -data.tau[:, 6:, None]).solution[..., 0]
+    return own
+
+
+def system_of(legged: Legged) -> forcegp.ConstrainedSystem:
+    """The robot file and its feet on the floor."""
+    floor, radius = forcegp.Plane(offset=0.0), legged.kind.radius
+    feet = [forcegp.SurfaceContact(f, f, (0.0, 0.0, 0.0), floor, radius=radius) for f in legged.kind.feet]
+    return forcegp.ConstrainedSystem(legged.robot, feet)
+
+
+def score(
+    data: forcegp.Dataset, force: dict[str, torch.Tensor], std: dict[str, torch.Tensor] | None = None
+) -> dict[str, Any]:
+    """RMSE of each axis over all feet [N], median σ and coverage of ±2σ."""
+    closed = {foot: data.contact[foot] for foot in force}
+    error = torch.cat([(force[f] - data.contact_extras["F"][f])[c] for f, c in closed.items()])
+    result: dict[str, Any] = {"rmse_N": error.square().mean(0).sqrt().tolist()}
+    if std is not None:
+        sigma = torch.cat([std[f][c] for f, c in closed.items()])
+        result["median_std_N"] = sigma.median(0).values.tolist()
+        result["coverage"] = (error.abs() <= 2.0 * sigma).double().mean(0).tolist()
+    return result
+
+
+def case(name: str, friction: str, seed: int) -> dict[str, Any]:
+    """Scores of all methods on one robot."""
+    legged = Legged(name, friction, seed)
+    system = system_of(legged)
+    trot = legged.steps(np.array([0.0, 0.5, 0.5, 0.0]), 0.55, 1.8, np.array([0.04, 0.0, 0.0]))
+    walk = legged.steps(np.array([0.0, 0.5, 0.75, 0.25]), 0.78, 1.0, np.array([0.05, 0.0, 0.0]))
+    parts = [(legged.sway(), 0.4 * SECONDS["train"]), (trot, 0.6 * SECONDS["train"])]
+    train = forcegp.Dataset.concatenate([dataset(legged, legged.record(*part)) for part in parts])
+    test = dataset(legged, legged.record(walk, SECONDS["test"]))[::TESTED]
+    began = time.perf_counter()
+    fit = forcegp.StructuredGP(system).fit(train[::EVERY])
+    seconds = time.perf_counter() - began
+    result: dict[str, Any] = {"legs": score(test, of_legs(system, test))}
+    for label, identifies in {"equations of motion": False, "identified": True}.items():
+        result[label] = score(test, Plain(system, train[::EVERY], identifies).forces(test))
+    read = fit.contact_force(test)
+    force, std = ({foot: x[:, own] for foot, own in read.parts.items()} for x in (read.mean, read.std))
+    result["forcegp"] = {**score(test, force, std), "seconds": seconds}
+    push = legged.pushed()
+    rows = legged.record(legged.sway(), SECONDS["test"], push)
+    true = torch.tensor(np.array([push(t) for t in rows["t"]]))[::TESTED]
+    data, point = dataset(legged, rows)[::TESTED], tuple(legged.true.body_ipos[legged.trunk].tolist())
+    frame = legged.true.body(legged.trunk).name
+    plain = Plain(system, train[::EVERY], False).forces(data, (frame, point))["trunk"]
+    wrench = fit.external_wrench(data, frame, axes=("fx", "fy", "fz"), point=point)
+    acts = true.norm(dim=-1) > 0.0
+    before, after = ((x - true)[acts].square().sum(-1).mean().sqrt() for x in (plain, wrench.mean))
+    assert wrench.std is not None
+    covered = ((wrench.mean - true).abs() <= 2.0 * wrench.std)[acts].double().mean()
+    result["push"] = {"equations_N": float(before), "rmse_N": float(after), "coverage": float(covered)}
+    trunk = {each.name: each for each in fit.parameters() if each.name == "inertial.m of base_roll"}
+    for each in trunk.values():
+        true = float(legged.true.body_mass[legged.trunk] - legged.nominal.body_mass[legged.trunk])
+        result["trunk"] = {"true_kg": true, "found_kg": each.value, "std_kg": each.std}
+    return result
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--robot", choices=tuple(ROBOTS), action="append")
+    parser.add_argument("--friction", choices=("coulomb", "dahl"), action="append")
+    parser.add_argument("--seeds", type=int, nargs="*", default=[0, 1])
+    parser.add_argument("--json", type=Path)
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    warnings.simplefilter("ignore")
+    robots, frictions = options.robot or tuple(ROBOTS), options.friction or ("coulomb", "dahl")
+    results, lines = [], []
+    for seed, name, friction in itertools.product(options.seeds, robots, frictions):
+        found = case(name, friction, seed)
+        results.append({"robot": name, "friction": friction, "seed": seed, **found})
+        print(json.dumps(results[-1]), flush=True)
+        own = found["forcegp"]
+        size = {key: float(np.linalg.norm(found[key]["rmse_N"])) for key in METHODS}
+        ratios = [f"{size['forcegp'] / size[key]:.2f}" for key in METHODS[:3]]
+        covered = " ".join(f"{x:.2f}" for x in own["coverage"])
+        lines.append([f"{name}, {friction}, {seed}", f"{size['forcegp']:.2f}", *ratios, covered])
+    print(table(["case", "RMSE [N]", "÷ legs", "÷ equations", "÷ identified", "coverage of ±2σ"], lines))
+    if options.json:
+        options.json.write_text(json.dumps(results, indent=2) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,85 @@
+"""A legged robot in MuJoCo: its base has no motor and no friction, and its feet are read along a log."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+import torch
+
+import forcegp
+from forcegp.forces.noise import EXACT, TORQUE_NOISE
+from forcegp.forces.priors.joint import JointFrictionPrior
+from forcegp.forces.quantities import states
+from forcegp.models.structured_fit import StructuredFit
+from robots import example_data
+
+pytest.importorskip("mujoco")
+import legs
+
+
+@cache
+def walking() -> tuple[forcegp.ConstrainedSystem, forcegp.Dataset, forcegp.Dataset, float]:
+    """A Solo12 that sways and trots, then walks, and the mass that its trunk has above the file."""
+    legged = legs.Legged("solo12", "coulomb", 3)
+    trot = legged.steps(np.array([0.0, 0.5, 0.5, 0.0]), 0.55, 1.8, np.array([0.04, 0.0, 0.0]))
+    walk = legged.steps(np.array([0.0, 0.5, 0.75, 0.25]), 0.78, 1.0, np.array([0.05, 0.0, 0.0]))
+    parts = [legs.dataset(legged, legged.record(*part)) for part in ((legged.sway(), 4.0), (trot, 6.0))]
+    test = legs.dataset(legged, legged.record(walk, 4.0))
+    added = float(legged.true.body_mass[legged.trunk] - legged.nominal.body_mass[legged.trunk])
+    return legs.system_of(legged), forcegp.Dataset.concatenate(parts)[::5], test[::10], added
+
+
+@cache
+def fitted() -> StructuredFit:
+    """A default fit."""
+    system, train, _, _ = walking()
+    return forcegp.StructuredGP(system).fit(train)
+
+
+def test_a_free_base_has_no_joint_forces() -> None:
+    robot = forcegp.load_robot(example_data() / "solo_description/robots/solo12.urdf", base="free")
+    assert robot.driven.tolist() == [False] * 6 + [True] * 12
+    assert bool(forcegp.load_robot("kuka_iiwa").driven.all())
+    system = forcegp.ConstrainedSystem(robot)
+    q = torch.randn(3, robot.nq, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    at, prior = states(system, q, q, q, torch.ones(3, 0, dtype=torch.bool)), JointFrictionPrior()
+    E = prior.operator(system, at)
+    torch.testing.assert_close(E, torch.diag(robot.driven.double()).expand_as(E))
+    B = torch.randn(3, 4, robot.nq, dtype=torch.float64)
+    torch.testing.assert_close(prior.applied(B, system, at), B @ E)
+
+
+@pytest.mark.slow
+def test_feet_of_a_walking_robot() -> None:
+    system, train, test, _ = walking()
+    read = fitted().contact_force(test)
+    assert read.mean.shape == (len(test), 12) and list(read.parts) == list(system.contact_names)
+    assert read.std is not None
+    force, std = ({f: x[:, own] for f, own in read.parts.items()} for x in (read.mean, read.std))
+    own = legs.score(test, force, std)
+    plain = legs.score(test, legs.Plain(system, train, False).forces(test))
+    alone = legs.score(test, legs.of_legs(system, test))
+    sizes = [float(np.linalg.norm(x["rmse_N"])) for x in (own, plain, alone)]
+    assert sizes[0] < 0.6 * sizes[1] and sizes[0] < 0.4 * sizes[2]
+    assert np.mean(own["coverage"]) > 0.75
+    for foot, x in force.items():
+        open_ = ~test.contact[foot]
+        assert bool((x[open_] == 0.0).all()) and bool((std[foot][open_] == 0.0).all())
+    one = fitted().contact_force(test, system.contact_names[2])
+    torch.testing.assert_close(one.mean, force[system.contact_names[2]], rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.slow
+def test_the_base_has_exact_torques_and_the_trunk_is_weighed() -> None:
+    *_, added = walking()
+    fit = fitted()
+    noise = fit.hyperparameters[TORQUE_NOISE].exp()
+    assert noise[:6].tolist() == pytest.approx([EXACT] * 6) and float(noise[6:].min()) > 100.0 * EXACT
+    found = {each.name: each for each in fit.parameters()}
+    assert not any("base" in name for name in found if not name.startswith("inertial."))
+    assert not any(name.startswith("inertial.drive of base") for name in found)
+    mass = found["inertial.m of base_roll"]
+    assert mass.determined and abs(mass.value - added) < 2.0 * mass.std
+    assert not any("too few to check the masses" in text for text in fit.result.warnings)
