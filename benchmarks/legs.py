@@ -1,11 +1,12 @@
 """Feet of legged robots that MuJoCo moves: forces along the log, learned on one gait and tested on another.
 
-    python benchmarks/legs.py --json legs.json            # two robots, two frictions, two seeds
+    python benchmarks/legs.py --json legs.json            # two robots, three frictions, two seeds
     python benchmarks/legs.py --robot solo12 --friction coulomb --seeds 0
 
 The true robot has joint friction, a payload of a tenth of its mass on the trunk, and links that differ from
 the file by 5 %. Torques, encoders and the IMU are noisy. Training logs hold standing, swaying and a trot;
-the test is a walk. The force of each foot along the log is compared with the engine's.
+the test is a walk. The force of each foot along the log is compared with the engine's, as are pushes on the
+trunk while swaying.
 
 - `legs`: −J⁻ᵀτ of each leg by itself, with gravity and motion of the leg's links ignored.
 - `equations of motion`: M q̈ − Q_K − τ = Σ JᵀF with the file, by generalized least squares.
@@ -40,8 +41,12 @@ from forcegp.kinematics import frame_jacobian
 
 mujoco = optional_module("mujoco", "This benchmark")
 Array = NDArray[np.float64]
+FRICTIONS = ("coulomb", "soft", "dahl")
 DISTANCE = 0.02
 """Over which Dahl's friction develops [rad]."""
+HARD = 0.002
+"""Time constant of Coulomb friction [s]. That of `soft`, MuJoCo's default, is 0.02 s: joints creep, and their
+friction depends on their acceleration."""
 STEP, RATE = 0.0005, 500
 """Time step of the engine [s] and rate of the log [Hz]."""
 SECONDS = {"train": 20.0, "test": 10.0}
@@ -122,8 +127,10 @@ class Legged:
         self.dry[self.dof] = 0.08 * load * random.uniform(0.5, 1.5, n)
         model.dof_damping[self.dof] = 0.02 * load * random.uniform(0.5, 1.5, n)
         self.friction = friction
-        if friction == "coulomb":
+        if friction != "dahl":
             model.dof_frictionloss[:] = self.dry
+        if friction == "coulomb":
+            model.dof_solref[:, 0] = HARD
         self.feet = [model.body(foot).id for foot in self.kind.feet]
         mujoco.mj_setConst(model, mujoco.MjData(model))
         self.stand = self._standing()
@@ -478,13 +485,13 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--robot", choices=tuple(ROBOTS), action="append")
-    parser.add_argument("--friction", choices=("coulomb", "dahl"), action="append")
+    parser.add_argument("--friction", choices=FRICTIONS, action="append")
     parser.add_argument("--seeds", type=int, nargs="*", default=[0, 1])
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
     torch.set_num_threads(1)
     warnings.simplefilter("ignore")
-    robots, frictions = options.robot or tuple(ROBOTS), options.friction or ("coulomb", "dahl")
+    robots, frictions = options.robot or tuple(ROBOTS), options.friction or FRICTIONS
     results, lines = [], []
     for seed, name, friction in itertools.product(options.seeds, robots, frictions):
         found = case(name, friction, seed)

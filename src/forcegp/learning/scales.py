@@ -320,7 +320,7 @@ def _with_noise(found: Scales, speeds: Sequence[float]) -> tuple[Tensors, float]
         whole, slice(0, nq), values[STICK_SPEED], speeds or None, theta, stated
     )
     changed = {STICK_SPEED: torch.full_like(values[STICK_NOISE], speed)}
-    if tips:
+    if tips and bool(driven.all()):
         now, first = (torch.stack([x[tip.speed] for tip in tips]) for x in (values, found.stated_noise))
         least = math.exp(float(first.max()))
         above = (least, *(speed for speed in speeds if speed > least)) if speeds else None
