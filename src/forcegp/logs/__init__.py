@@ -18,6 +18,7 @@ from forcegp.data import DataHeader, Dataset
 from forcegp.data.clipped import clipped
 from forcegp.errors import DataError
 from forcegp.guards import foreign
+from forcegp.logs.base import add_imu
 from forcegp.logs.clock import even_clock, usual_step
 from forcegp.logs.compensated import restore
 from forcegp.logs.contact import Evidence, detect, per_contact
@@ -119,7 +120,7 @@ def import_log(
             announce_memory(8 * NUMBERS * system.robot.nq * len(signals), f"importing {len(signals):,} rows")
             check_clock(signals, system.robot.revolute.numpy() > 0.0, report)
             find_jumps(signals, report)
-            derived = tuple(name for name in ("qd", "qdd") if name not in signals.vectors)
+            derived = tuple(name for name in ("qd", "qdd") if signals.lacking(name).any())
             even_clock(signals, log_mapping.sections.time.period, report)
             derive_joints(signals, system, log_mapping, report)
             smooth = without_noise(signals, log_mapping) if "tau" in signals.vectors else None
@@ -127,6 +128,7 @@ def import_log(
             _find_clipped(signals, log_mapping)
             evidence = _contacts(signals, system, log_mapping, report, displaced)
             std = add_derivatives(signals, log_mapping.sections.derivatives, report)
+            std = add_imu(signals, std, system.robot, log_mapping, report)
             std = damp(signals, _treat_clipped(signals, std, log_mapping, report), log_mapping, report)
             restore(signals, system.robot, log_mapping, report)
             if smooth is not None:
@@ -154,7 +156,8 @@ def _contacts(
         return detect(signals, system, mapping, report, displaced)
     copies = {name: value.copy() for name, value in signals.vectors.items()}
     trial = replace(signals, vectors=copies, contact={}, row=np.arange(len(signals)))
-    add_derivatives(trial, mapping.sections.derivatives, ImportReport(report.source))
+    std = add_derivatives(trial, mapping.sections.derivatives, ImportReport(report.source))
+    add_imu(trial, std, system.robot, mapping, ImportReport(report.source))
     restore(trial, system.robot, mapping, ImportReport(report.source))
     kept = np.zeros(len(signals), dtype=bool)
     kept[trial.row] = True

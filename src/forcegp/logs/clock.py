@@ -170,7 +170,10 @@ def onto(t: Array, values: Array, at: Array, cubic: bool = False) -> Array:
     """Interpolate values (n, d) from times t to times `at`, linearly or by a cubic spline."""
     from scipy.interpolate import CubicSpline, make_interp_spline
 
-    return CubicSpline(t, values)(at) if cubic and len(t) >= 4 else make_interp_spline(t, values, k=1)(at)
+    result, logged = np.full((len(at), values.shape[1]), np.nan), ~np.isnan(values).all(axis=0)
+    x = values[:, logged]
+    result[:, logged] = CubicSpline(t, x)(at) if cubic and len(t) >= 4 else make_interp_spline(t, x, k=1)(at)
+    return result
 
 
 def even_clock(signals: Signals, period: float | None, report: ImportReport) -> None:

@@ -53,7 +53,7 @@ def restore(signals: Signals, robot: RobotModel, mapping: Mapping, report: Impor
     if torque.compensated is None:
         return
     q, qd, qdd = (signals.vectors[name] for name in ("q", "qd", "qdd"))
-    measured = ~np.isin(signals.joint_names, torque.unmeasured)
+    measured = np.isin(signals.joint_names, mapping.measured("torque", signals.joint_names))
     added = subtracted(robot, torque.compensated, q, qd, qdd)
     signals.vectors["tau"] = signals.vectors["tau"] + added * measured
     text = f"added {NAMED[torque.compensated]} of the robot file to the torque, as the driver subtracts it"

@@ -17,6 +17,7 @@ import torch
 
 from forcegp.errors import DataError
 from forcegp.logs import units
+from forcegp.logs.base import FOOT, ORIENTATION, check_base, columns_of_base, orientations, place_base
 from forcegp.logs.clock import drop_repeated, find_held, join_stream, split_trajectories
 from forcegp.logs.headings import doubtful, named_like, tokens
 from forcegp.logs.mapping import LOGGED, SYMBOLS, Mapping
@@ -46,6 +47,9 @@ def gather(
             needed |= set(mapping.columns_of(name, joints))
     if sections.wrench is not None:
         needed |= {*sections.wrench.force, *(sections.wrench.torque or ())}
+    if sections.base is not None:
+        needed |= {column for _, columns, *_ in columns_of_base(sections.base) for column in columns}
+        needed |= set(sections.base.feet.values())
     needed |= {c for each in sections.contact.values() for c in (each.column, each.sticks) if c is not None}
     table = read(path, wanted=needed.__contains__, rows=rows, progress=progress)
     report.format = table.format
@@ -88,6 +92,11 @@ class _Gathering:
         self.table, self.mapping, self.robot, self.report = table, mapping, robot, report
         self.joints = joints = robot.joint_names
         self.time, position = mapping.sections.time, mapping.columns_of("position", joints)
+        if not position:
+            raise mapping.error(
+                ("position",), "no joint is left", expected="a joint beside those of the base"
+            )
+        check_base(robot, mapping)
         self.origin: list[float] = []
         self.reference = table.stream_of(position[0], mapping.sections.position.stream)
 
@@ -97,7 +106,7 @@ class _Gathering:
         vectors = {LOGGED[name]: self._vector(name) for name in quantities}
         if self.mapping.sections.wrench is not None:
             vectors["wrench"] = self._wrench()
-        vectors |= self._flags()
+        vectors |= {**self._flags(), **self._base()}
         signals = self._reference({n: x for n, (stream, x) in vectors.items() if stream is self.reference})
         for name, (stream, values) in vectors.items():
             if stream is not self.reference:
@@ -106,6 +115,7 @@ class _Gathering:
                 join_stream(signals, name, t[good], values[good], self.time.gap, self.report)
         for key in [key for key in signals.vectors if key.startswith(CLOSED)]:
             signals.contact[key.removeprefix(CLOSED)] = signals.vectors.pop(key)[:, 0] >= 0.5
+        place_base(signals, self.robot, self.mapping, self.report)
         return signals
 
     def _is_logged(self, name: str) -> bool:
@@ -188,19 +198,41 @@ class _Gathering:
         return stream, result
 
     def _flags(self) -> dict[str, tuple[Stream, Array]]:
-        """Return the flags of closed and sticking contacts, keyed by `CLOSED` or `STICKS` plus the name."""
-        flags = {}
+        """Return the flags of closed and sticking contacts, and of feet at rest, keyed by `CLOSED`, `STICKS`
+        or `FOOT` plus the name."""
+        columns: dict[str, tuple[str | None, str | None]] = {}
         for name, section in self.mapping.sections.contact.items():
-            columns = {CLOSED: section.column if section.source == "column" else None, STICKS: section.sticks}
-            for key, column in ((key, column) for key, column in columns.items() if column is not None):
-                stream = self.table.stream_of(column, section.stream)
-                values = self._take(stream, column)
-                wrong = np.flatnonzero((values != 0.0) & (values != 1.0))
-                if len(wrong):
-                    text = f"{self.table.source}: column {column!r} is not a flag in row {wrong[0]}"
-                    raise DataError(text, expected="0 or 1", got=values[wrong[0]])
-                flags[f"{key}{name}"] = stream, values[:, None]
+            columns[f"{CLOSED}{name}"] = (
+                section.column if section.source == "column" else None,
+                section.stream,
+            )
+            columns[f"{STICKS}{name}"] = section.sticks, section.stream
+        if (base := self.mapping.sections.base) is not None:
+            columns |= {f"{FOOT}{frame}": (column, base.stream) for frame, column in base.feet.items()}
+        flags = {}
+        for key, (column, name) in columns.items():
+            if column is None:
+                continue
+            stream = self.table.stream_of(column, name)
+            values = self._take(stream, column)
+            wrong = np.flatnonzero((values != 0.0) & (values != 1.0))
+            if len(wrong):
+                text = f"{self.table.source}: column {column!r} is not a flag in row {wrong[0]}"
+                raise DataError(text, expected="0 or 1", got=values[wrong[0]])
+            flags[key] = stream, values[:, None]
         return flags
+
+    def _base(self) -> dict[str, tuple[Stream, Array]]:
+        """Return the vectors of a floating base (n, 3) in SI units, and its quaternions (n, 4)."""
+        if (section := self.mapping.sections.base) is None:
+            return {}
+        vectors = {}
+        for name, columns, factor, where in columns_of_base(section):
+            stream = self.table.stream_of(columns[0], where)
+            values = factor * np.stack([self._take(stream, column) for column in columns], axis=1)
+            turn = name == ORIENTATION
+            vectors[name] = stream, orientations(values, section, self.report) if turn else values
+        return vectors
 
     def _stamps(self, stream: Stream) -> Array:
         """Return the time stamps of a stream [s]."""

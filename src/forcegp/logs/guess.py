@@ -22,6 +22,7 @@ from forcegp.errors import DataError
 from forcegp.forces.term import SHARPEST
 from forcegp.guards import foreign
 from forcegp.logs import units
+from forcegp.logs.base import add_imu
 from forcegp.logs.clock import even_clock
 from forcegp.logs.compensated import restore, subtracted
 from forcegp.logs.contact import force_levels, multiplier
@@ -181,7 +182,8 @@ def _signals(path: str | Path, draft: Draft, system: ConstrainedSystem, without:
     signals = gather(path, mapping, system.robot, report, rows=ROWS)
     even_clock(signals, None, report)
     settings = mapping.sections.derivatives.model_copy(update={"source": "position"})
-    add_derivatives(signals, settings, report)
+    std = add_derivatives(signals, settings, report)
+    add_imu(signals, std, system.robot, mapping, report)
     restore(signals, system.robot, mapping, report)
     return signals
 

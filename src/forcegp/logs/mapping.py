@@ -25,6 +25,7 @@ from forcegp.guards import is_file
 from forcegp.logs import units
 from forcegp.logs.readers import read
 from forcegp.logs.table import left_out
+from forcegp.robot.free_base import BASE_JOINTS
 from forcegp.scene.document import Document, Key
 from forcegp.scene.sections import Section
 
@@ -262,6 +263,40 @@ class WrenchSection(Section):
     tool_com: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
+Triple = tuple[str, str, str]
+"""Columns of x, y and z, or of roll, pitch and yaw."""
+
+
+class BaseSection(Section):
+    """`[base]`: the columns of the motion of a floating base, in SI units but for `angle_unit` and
+    `acceleration_unit`. `rpy` are roll, pitch and yaw with R = R_z R_y R_x, as the joints of a free base.
+
+    `imu_position` [m] and `imu_rpy` [rad] place the sensor in `imu_frame`. With `gravity`, an accelerometer
+    at rest reads +g along the upward axis. Without `position`, the base is carried by feet at rest: `feet`
+    names the column that flags the contact of each such frame.
+    """
+
+    position: Triple | None = None
+    quaternion: tuple[str, str, str, str] | None = None
+    quaternion_order: Literal["wxyz", "xyzw"] | None = None
+    rpy: Triple | None = None
+    linear_velocity: Triple | None = None
+    linear_axes: Literal["world", "body"] | None = None
+    angular_velocity: Triple | None = None
+    angular_axes: Literal["world", "body"] | None = None
+    stream: str | None = None
+    imu_frame: str | None = None
+    imu_position: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    imu_rpy: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    gyro: Triple | None = None
+    accelerometer: Triple | None = None
+    gravity: bool | None = None
+    imu_stream: str | None = None
+    feet: dict[str, str] = Field(default_factory=dict)
+    angle_unit: Literal["rad", "deg"] = "rad"
+    acceleration_unit: Literal["m/s2", "g"] = "m/s2"
+
+
 class ContactStateSection(Section):
     """`[contact.<name>]`: the source of the state of a contact in the scene."""
 
@@ -297,6 +332,7 @@ class MappingSections(Section):
     torque: TorqueSection | None = None
     servo: ServoSection | None = None
     wrench: WrenchSection | None = None
+    base: BaseSection | None = None
     contact: dict[str, ContactStateSection] = Field(default_factory=dict)
     derivatives: DerivativesSection = DerivativesSection()
 
@@ -322,13 +358,18 @@ class Mapping:
         """The table of the torque, with defaults for the log of servos."""
         return self.sections.torque or TorqueSection(unit="Nm", clipped="keep")
 
+    @property
+    def base(self) -> tuple[str, ...]:
+        """The joints of the free base, if `[base]` contains its motion."""
+        return BASE_JOINTS if self.sections.base is not None else ()
+
     def measured(self, name: str, joints: Sequence[str]) -> list[str]:
-        """Return the joints for which a quantity is logged. Joints with an `unmeasured` torque, or with
-        motion derived from a contact, are excluded."""
+        """Return the joints with a column of a quantity. Joints with an `unmeasured` torque, with motion
+        derived from a contact, or of the free base in `[base]` are excluded."""
         name, key = ("torque", "unmeasured") if name == "torque" else ("position", "from_contact")
         lacking = getattr(self.quantity(name), key)
         self._check_joints((name, key), lacking, joints)
-        return [joint for joint in joints if joint not in lacking]
+        return [joint for joint in joints if joint not in lacking and joint not in self.base]
 
     def columns_of(self, name: str, joints: Sequence[str]) -> list[str]:
         """Return the column of a quantity for each joint for which the quantity is logged."""
@@ -346,9 +387,10 @@ class Mapping:
             text = f"joint {lacking[0]!r} has no column"
             expected = f'{quoted(lacking[0])} = "…" under columns'
             unmeasured = f"if it has no torque sensor, unmeasured = {json.dumps(lacking)} under [torque]"
-            raise self.error(
-                (name,), text, expected, hint=unmeasured if name == "torque" else lock_hint(lacking)
-            )
+            hint = unmeasured if name == "torque" else lock_hint(lacking)
+            if lacking[0] in BASE_JOINTS:
+                hint = "a table [base] maps the pose and the velocities of a floating base"
+            raise self.error((name,), text, expected, hint=hint)
         columns = [named[joint] for joint in measured]
         if len(set(columns)) < len(columns):
             twice = next(c for c in columns if columns.count(c) > 1)
@@ -435,6 +477,8 @@ def _check(mapping: Mapping) -> None:
     if wrench is not None and (len(wrench.force) == 2 or (len(wrench.force) == 1 and wrench.torque)):
         got = f"{len(wrench.force)} columns{', and those of a torque' if wrench.torque else ''}"
         raise mapping.error(("wrench", "force"), "not a force", "one column, or three, of x, y and z", got)
+    if sections.base is not None:
+        _check_base(mapping, sections.base)
     time, derivatives = sections.time, sections.derivatives
     if len(time.columns) != len(time.factors) or not time.columns:
         text, got = "the columns of the clock need one unit each", f"{len(time.factors)} units"
@@ -446,6 +490,35 @@ def _check(mapping: Mapping) -> None:
         raise mapping.error(key, "the filter is not defined", "an odd window > order", got)
     if derivatives.source == "velocity" and sections.velocity is None:
         raise mapping.error(("derivatives", "source"), "the velocity is not mapped", "a table [velocity]")
+
+
+def _check_base(mapping: Mapping, base: BaseSection) -> None:
+    """Check which columns of a floating base are given, and that their axes are."""
+    if (base.quaternion is None) == (base.rpy is None):
+        raise mapping.error(("base",), "one orientation is needed", "quaternion = […], or rpy = […]")
+    if (base.position is None) == (not base.feet):
+        expected = "position = […], or feet = {…} if no position is logged"
+        raise mapping.error(("base",), "one source of the position is needed", expected)
+    if base.angular_velocity is not None and base.gyro is not None:
+        expected = "angular_velocity = […], or gyro = […] with imu_frame"
+        raise mapping.error(("base", "gyro"), "one angular velocity is needed", expected)
+    for given, needed, choice in (
+        ("quaternion", "quaternion_order", '"wxyz" or "xyzw"'),
+        ("linear_velocity", "linear_axes", '"world" or "body"'),
+        ("angular_velocity", "angular_axes", '"world" or "body"'),
+        ("gyro", "imu_frame", "a frame of the robot"),
+        ("accelerometer", "imu_frame", "a frame of the robot"),
+        ("accelerometer", "gravity", "true (proper acceleration), or false if gravity is removed"),
+    ):
+        if getattr(base, given) is not None and getattr(base, needed) is None:
+            raise mapping.error(("base", given), f"key {needed!r} is missing", f"{needed} = {choice}")
+    for got, unsupported in (
+        ("[servo]", mapping.sections.servo is not None),
+        ("from_contact under [position]", bool(mapping.sections.position.from_contact)),
+    ):
+        if unsupported:
+            expected = "logged torques, and a column for each joint beside the base"
+            raise mapping.error(("base",), f"{got} is not available with a floating base", expected)
 
 
 def _check_quantity(mapping: Mapping, name: str, section: QuantitySection) -> None:

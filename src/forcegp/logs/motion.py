@@ -150,7 +150,10 @@ def find_jumps(signals: Signals, report: ImportReport) -> None:
 
 def _residuals(moved: Array, qd: Array | None, step: float, inner: NDArray[np.bool_]) -> tuple[Array, Array]:
     """Return Δq − q̇ Δt and q̇ Δt, both (n, nq) and in units of the noise of each joint."""
-    meant = median_filter(moved, (NEIGHBOURS, 1)) if qd is None else 0.5 * step * (qd[1:] + qd[:-1])
+    meant = median_filter(moved, (NEIGHBOURS, 1))
+    if qd is not None:
+        logged = 0.5 * step * (qd[1:] + qd[:-1])
+        meant = np.where(np.isnan(logged), meant, logged)
     residual = moved - meant
     residual -= median_filter(residual, (NEIGHBOURS, 1))  # such as the lag of a filtered velocity
     resolution = np.min(np.abs(moved), axis=0, where=moved != 0.0, initial=np.inf)

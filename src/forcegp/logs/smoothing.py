@@ -157,10 +157,11 @@ def _run(y: Array, gain: Array, back: Array) -> Array:
 
 def add_derivatives(signals: Signals, settings: DerivativesSection, report: ImportReport) -> Array | None:
     """Compute missing `qd` and `qdd` piece by piece between contact switches, and filter the torque as well.
+    If q̈ is logged in some joints only, it is filtered too.
 
     Return σ of the computed q̈ `(n, nq)`, or `None` if q̈ is logged.
     """
-    missing = [name for name in ("qd", "qdd") if name not in signals.vectors]
+    missing = [name for name in ("qd", "qdd") if signals.lacking(name).any()]
     if not missing:
         return None
     golay = settings.method == "savitzky_golay"
@@ -172,7 +173,7 @@ def add_derivatives(signals: Signals, settings: DerivativesSection, report: Impo
     report.steps.append(f"computed {' and '.join(missing)} by {how}")
     if "qdd" in missing and settings.filter_torque:
         report.steps.append("passed the torque through the same filter")
-    return std if std is None else _above_zero(std, report)
+    return std if std is None else above_zero(std, report)
 
 
 LEAST_STD = 1e-3
@@ -180,7 +181,7 @@ LEAST_STD = 1e-3
 that rests throughout a log of a real Kinova has none otherwise, which a fit rejects."""
 
 
-def _above_zero(std: Array, report: ImportReport) -> Array:
+def above_zero(std: Array, report: ImportReport) -> Array:
     """Raise σ of q̈ where a joint at rest shows no noise because its readings do not change by one step."""
     least = LEAST_STD * np.sqrt(np.mean(std**2))
     raised = int((std < least).sum())
@@ -210,12 +211,17 @@ def _filter(signals: Signals, piece: NDArray[np.int64], settings: DerivativesSec
     from scipy.signal import savgol_filter
 
     method, vectors = SavitzkyGolay(settings.window, settings.order), signals.vectors
-    of, degree = ("qd", 1) if "qd" in vectors and settings.source != "position" else ("q", 2)
-    if "qd" not in vectors:
-        vectors["qd"], _ = differentiate(signals.t, vectors["q"], piece, method, 1)
-    if "qdd" in vectors:
+    no_qd, no_qdd = _unlogged(signals)
+    if no_qd.any():
+        vectors["qd"][:, no_qd], _ = differentiate(signals.t, vectors["q"][:, no_qd], piece, method, 1)
+    if not no_qdd.any():
         return None
-    vectors["qdd"], std = differentiate(signals.t, vectors[of], piece, method, degree)
+    std = np.empty_like(vectors["q"])
+    of_qd = no_qdd & ~no_qd & (settings.source != "position")
+    for of, degree, joints in (("qd", 1, of_qd), ("q", 2, no_qdd & ~of_qd), ("qdd", 0, ~no_qdd)):
+        if joints.any():
+            x = vectors[of][:, joints]
+            vectors["qdd"][:, joints], std[:, joints] = differentiate(signals.t, x, piece, method, degree)
     if settings.filter_torque:
         for rows in runs(piece):
             tau = vectors["tau"][rows]
@@ -225,20 +231,45 @@ def _filter(signals: Signals, piece: NDArray[np.int64], settings: DerivativesSec
 
 def _smooth(signals: Signals, piece: NDArray[np.int64], settings: DerivativesSection) -> Array | None:
     """Apply the Kalman smoother to each joint, and to the torque if requested; return σ of q̈."""
-    vectors, missing = signals.vectors, {"qd", "qdd"} - set(signals.vectors)
-    filtered, std = "qdd" in missing and settings.filter_torque, np.empty_like(vectors["q"])
-    for name in missing:
-        vectors[name] = np.empty_like(std)
+    no_qd, no_qdd = _unlogged(signals)
+    vectors, std = signals.vectors, np.empty_like(signals.vectors["q"])
     for joint in range(len(signals.joint_names)):
-        tau = vectors["tau"][:, joint] if filtered else None
+        tau = vectors["tau"][:, joint] if no_qdd.any() and settings.filter_torque else None
         result = smooth(signals.t, vectors["q"][:, joint], piece, tau)
         std[:, joint] = result.acceleration_std
-        for name, value in (("qd", result.velocity), ("qdd", result.acceleration)):
-            if name in missing:
-                vectors[name][:, joint] = value
+        if no_qd[joint]:
+            vectors["qd"][:, joint] = result.velocity
+        if no_qdd[joint]:
+            vectors["qdd"][:, joint] = result.acceleration
+        elif no_qdd.any():
+            logged, sigma = filtered(signals.t, vectors["qdd"][:, [joint]], piece, settings)
+            vectors["qdd"][:, joint], std[:, joint] = logged[:, 0], sigma[:, 0]
         if result.also is not None:
             vectors["tau"][:, joint] = result.also
-    return std if "qdd" in missing else None
+    return std if no_qdd.any() else None
+
+
+def _unlogged(signals: Signals) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Return the masks (nq,) of joints without logged q̇ and q̈, and make space for these vectors."""
+    masks = signals.lacking("qd"), signals.lacking("qdd")
+    for name in ("qd", "qdd"):
+        if name not in signals.vectors:
+            signals.vectors[name] = np.empty_like(signals.vectors["q"])
+    return masks
+
+
+def filtered(
+    t: Array, x: Array, piece: NDArray[np.int64], settings: DerivativesSection
+) -> tuple[Array, Array]:
+    """Return logged accelerations x (n, d) after the filter for derivatives, and σ of their noise (n, d).
+
+    For the smoother, this is σ before the filter, an upper bound.
+    """
+    if settings.method == "savitzky_golay":
+        return differentiate(t, x, piece, SavitzkyGolay(settings.window, settings.order), 0)
+    results = [smooth(t, column, piece) for column in x.T]
+    values = np.stack([result.position for result in results], axis=1)
+    return values, np.broadcast_to([result.noise_std for result in results], values.shape)
 
 
 def impact_mask(signals: Signals, margin: float) -> dict[str, Array]:

@@ -147,6 +147,7 @@ def table_of_arrays(
 class Signals:
     """Quantities in a log: the time [s], row number in the log and trajectory of each row, shape (n,); the
     vectors `q`, `qd`, `qdd`, `tau` (n, nq) and `wrench` (n, 6), if logged; and contacts by name, (n,) bool.
+    Columns of `qd` and `qdd` are NaN for joints in which they are not logged.
     """
 
     joint_names: tuple[str, ...]
@@ -159,6 +160,12 @@ class Signals:
     def __len__(self) -> int:
         """Return the number of rows."""
         return len(self.t)
+
+    def lacking(self, name: str) -> NDArray[np.bool_]:
+        """Return the mask (nq,) of the joints in which `qd` or `qdd` is not logged."""
+        if name not in self.vectors:
+            return np.ones(len(self.joint_names), dtype=bool)
+        return np.asarray(np.isnan(self.vectors[name]).all(axis=0))
 
     def keep(self, mask: NDArray[np.bool_], split: bool = False) -> None:
         """Keep only the rows in `mask` (n,). If `split` is set, trajectories are split at removed rows."""
