@@ -22,7 +22,8 @@ def turn(q: Tensor) -> Tensor:
     for angle, (i, j) in zip(q[3:6], ((0, 1), (2, 0), (1, 2)), strict=True):
         generator = torch.zeros(3, 3, dtype=q.dtype)
         generator[i, j], generator[j, i] = -1.0, 1.0
-        rotations.append(torch.linalg.matrix_exp(angle * generator))
+        unit = torch.eye(3, dtype=q.dtype)
+        rotations.append(unit + angle.sin() * generator + (1.0 - angle.cos()) * generator @ generator)
     return rotations[0] @ rotations[1] @ rotations[2]
 
 

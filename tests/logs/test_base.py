@@ -1,0 +1,407 @@
+"""Logs of floating bases of MuJoCo and Pinocchio, imported as the six joints of a free base."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pyarrow
+import pyarrow.parquet
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+import forcegp
+from forcegp.data.derivative import SavitzkyGolay, differentiate
+from forcegp.errors import DataError, MappingError
+from forcegp.logs import Imported, ImportReport, import_log, parse_mapping
+from forcegp.logs.base import IMU
+from forcegp.logs.gather import gather
+from free_flyer import HOPPER, body_velocity, turn
+from pinocchio_oracle import pin
+from robots import ARMS
+
+EXACT = 1e-9
+FILTERED = 1e-4
+"""Relative error of velocities from positions, 4e-5 for both filters and this motion."""
+WINDOW, DT = 11, 0.001
+IMU_SITE = '<site name="imu" pos=".05 -.02 .03" euler="30 40 20"/><body name="thigh"'
+SENSORS = '<sensor><accelerometer site="imu"/><gyro site="imu"/></sensor></mujoco>'
+MODEL = HOPPER.replace('<body name="thigh"', IMU_SITE).replace("</mujoco>", SENSORS)
+XYZ = "xyz"
+JOINTS = """
+[time]
+column = "t"
+[position]
+column = "q.{joint}"
+unit = "rad"
+[torque]
+column = "tau.{joint}"
+unit = "Nm"
+[derivatives]
+filter_torque = false
+[base]
+"""
+POSE = """position = ["p.x", "p.y", "p.z"]
+quaternion = ["r.0", "r.1", "r.2", "r.3"]
+quaternion_order = "wxyz"
+"""
+VELOCITY = """linear_velocity = ["v.x", "v.y", "v.z"]
+linear_axes = "world"
+"""
+SENSOR = """imu_frame = "imu"
+gyro = ["g.x", "g.y", "g.z"]
+accelerometer = ["f.x", "f.y", "f.z"]
+gravity = true
+"""
+
+
+def parts(name: str, values: np.ndarray, labels: str = XYZ) -> dict[str, np.ndarray]:
+    return {f"{name}.{label}": values[:, k] for k, label in enumerate(labels)}
+
+
+def written(path: Path, columns: dict[str, np.ndarray]) -> Path:
+    """A log with all digits."""
+    rows = (",".join(repr(float(x)) for x in row) for row in zip(*columns.values(), strict=True))
+    path.write_text("\n".join([",".join(columns), *rows]))
+    return path
+
+
+def euler_motion(angles: Tensor, w: np.ndarray, dw: np.ndarray) -> tuple[Tensor, Tensor]:
+    """Rates of yaw, pitch and roll and their derivatives, from ω and ω̇ in axes of the base."""
+    zero = torch.zeros(3, dtype=angles.dtype)
+
+    def spin(x: Tensor, rates: Tensor) -> Tensor:
+        return body_velocity(torch.cat([zero, x]), torch.cat([zero, rates]))[3:]
+
+    def motion(x: Tensor, v: Tensor, a: Tensor) -> tuple[Tensor, Tensor]:
+        E = torch.func.jacrev(lambda rates: spin(x, rates))(zero)
+        rates = torch.linalg.solve(E, v)
+        drift = torch.func.jvp(spin, (x, rates), (rates, zero))[1]
+        return rates, torch.linalg.solve(E, a - drift)
+
+    return torch.func.vmap(motion)(angles, torch.from_numpy(w), torch.from_numpy(dw))
+
+
+def filter_error(x: np.ndarray, xd: np.ndarray) -> float:
+    """The error of the filter on exact values x with derivatives xd."""
+    t, piece = DT * np.arange(len(x)), np.zeros(len(x), dtype=np.int64)
+    return float(np.abs(differentiate(t, x, piece, SavitzkyGolay(), 1)[0] - xd).max())
+
+
+@pytest.fixture(scope="module")
+def tumble() -> dict[str, np.ndarray]:
+    """A hopper that falls and tumbles while its legs are driven."""
+    model = mujoco.MjModel.from_xml_string(MODEL)
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
+    model.opt.integrator, model.opt.timestep = mujoco.mjtIntegrator.mjINT_RK4, DT
+    data = mujoco.MjData(model)
+    data.qvel[:6] = [0.8, -0.5, 3.0, 2.0, 0.5, -4.0]
+    names = ("t", "qpos", "qvel", "qacc", "tau", "sensor", "site")
+    log: dict[str, list[np.ndarray]] = {name: [] for name in names}
+    for k in range(1200):
+        data.qfrc_applied[6:] = [0.5 * np.sin(12.0 * k * DT), 0.3 * np.cos(17.0 * k * DT)]
+        mujoco.mj_forward(model, data)
+        acceleration = np.zeros(6)
+        kind = mujoco.mjtObj.mjOBJ_SITE
+        mujoco.mj_objectAcceleration(model, data, kind, model.site("imu").id, acceleration, 0)
+        values = (data.time, data.qpos, data.qvel, data.qacc, data.qfrc_applied[6:], data.sensordata)
+        for name, value in zip(names, (*values, acceleration[3:] + model.opt.gravity), strict=True):
+            log[name].append(np.array(value))
+        mujoco.mj_step(model, data)
+    return {name: np.array(values) for name, values in log.items()}
+
+
+def columns_of(log: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """The columns of a MuJoCo log. Quaternions change sign at random."""
+    flip = np.random.default_rng(0).choice([-1.0, 1.0], (len(log["t"]), 1))
+    return {
+        "t": log["t"],
+        **parts("p", log["qpos"]),
+        **parts("r", flip * log["qpos"][:, 3:7], "0123"),
+        **parts("q", log["qpos"][:, 7:], ("hip", "knee")),
+        **parts("v", log["qvel"]),
+        **parts("w", log["qvel"][:, 3:6]),
+        **parts("f", log["sensor"]),
+        **parts("g", log["sensor"][:, 3:6]),
+        **parts("tau", log["tau"], ("hip", "knee")),
+    }
+
+
+@pytest.fixture(scope="module")
+def robot(tmp_path_factory: pytest.TempPathFactory) -> forcegp.RobotModel:
+    path = tmp_path_factory.mktemp("robot") / "hopper.xml"
+    path.write_text(MODEL)
+    return forcegp.load_robot(path, base="free")
+
+
+def imported(path: Path, robot: forcegp.RobotModel, *tables: str) -> Imported:
+    return import_log(path, robot, parse_mapping("".join((JOINTS, *tables)).encode(), "m.toml"))
+
+
+def test_motion_of_mujoco(tmp_path: Path, robot: forcegp.RobotModel, tumble: dict[str, np.ndarray]) -> None:
+    path = written(tmp_path / "log.csv", columns_of(tumble))
+    result = imported(path, robot, POSE, VELOCITY, SENSOR)
+    assert not result.report.findings
+    q, qd, qdd, tau = (getattr(result.data, name).numpy() for name in ("q", "qd", "qdd", "tau"))
+    R = Rotation.from_quat(tumble["qpos"][:, [4, 5, 6, 3]]).as_matrix()
+    np.testing.assert_allclose(torch.func.vmap(turn)(result.data.q).numpy(), R, atol=EXACT)
+    assert (np.abs(np.diff(q[:, 3:6], axis=0)) < 0.1).all()
+    assert np.ptp(q[:, 3]) > np.pi, "yaw is to be unwrapped"
+    np.testing.assert_allclose(q[:, [0, 1, 2, 6, 7]], tumble["qpos"][:, [0, 1, 2, 7, 8]], atol=EXACT)
+    rates, second = euler_motion(result.data.q[:, 3:6], tumble["qvel"][:, 3:6], tumble["qacc"][:, 3:6])
+    np.testing.assert_allclose(qd[:, 3:6], rates, atol=EXACT)
+    np.testing.assert_allclose(qd[:, :3], tumble["qvel"][:, :3], atol=EXACT)
+    assert (tau[:, :6] == 0.0).all()
+    np.testing.assert_array_equal(tau[:, 6:], tumble["tau"])
+    # q̈ of the angles is as exact as the filter, and that of the slides follows from it by the lever.
+    turning = filter_error(rates.numpy(), second.numpy())
+    np.testing.assert_allclose(qdd[:, 3:6], second, atol=turning + EXACT)
+    smoothed = differentiate(tumble["t"], tumble["site"], np.zeros(len(q), np.int64), SavitzkyGolay(), 0)[0]
+    lever = np.linalg.norm([0.05, -0.02, 0.03])
+    bound = np.abs(smoothed - tumble["site"]).max() + np.sqrt(6.0) * lever * turning  # |E| ≤ √2
+    np.testing.assert_allclose(qdd[:, :3], tumble["qacc"][:, :3], atol=bound)
+    forces = forcegp.dynamics.inverse_dynamics(robot, result.data.q, result.data.qd, result.data.qdd)
+    weight = float(robot.mass.sum() * robot.gravity.norm())
+    assert float(forces[:, :6].abs().max()) < 1e-3 * weight
+
+
+def test_the_acceleration_of_the_sensor_is_exact(
+    tmp_path: Path, robot: forcegp.RobotModel, tumble: dict[str, np.ndarray]
+) -> None:
+    path = written(tmp_path / "log.csv", columns_of(tumble))
+    mapping = parse_mapping((JOINTS + POSE + SENSOR).encode(), "m.toml")
+    signals = gather(path, mapping, robot, ImportReport(str(path)))
+    np.testing.assert_allclose(signals.vectors[IMU], tumble["site"], atol=EXACT)
+
+
+BODY = """linear_velocity = ["vb.x", "vb.y", "vb.z"]
+linear_axes = "body"
+angular_velocity = ["ww.x", "ww.y", "ww.z"]
+angular_axes = "world"
+"""
+ANGLES = """position = ["p.x", "p.y", "p.z"]
+rpy = ["a.x", "a.y", "a.z"]
+angle_unit = "deg"
+linear_velocity = ["v.x", "v.y", "v.z"]
+linear_axes = "world"
+angular_velocity = ["wd.x", "wd.y", "wd.z"]
+angular_axes = "body"
+imu_frame = "trunk"
+imu_position = [0.05, -0.02, 0.03]
+imu_rpy = [0.0, 0.0, 1.5707963267948966]
+accelerometer = ["fg.x", "fg.y", "fg.z"]
+gravity = false
+acceleration_unit = "g"
+"""
+
+
+def test_other_conventions_give_the_same(
+    tmp_path: Path, robot: forcegp.RobotModel, tumble: dict[str, np.ndarray]
+) -> None:
+    columns = columns_of(tumble)
+    reference = imported(written(tmp_path / "log.csv", columns), robot, POSE, VELOCITY, SENSOR).data
+    R = Rotation.from_quat(tumble["qpos"][:, [4, 5, 6, 3]])
+    sensor = R * Rotation.from_euler("z", 0.5 * np.pi)
+    columns |= parts("vb", R.inv().apply(tumble["qvel"][:, :3]))
+    columns |= parts("ww", R.apply(tumble["qvel"][:, 3:6]))
+    columns |= parts("wd", np.degrees(tumble["qvel"][:, 3:6]))
+    columns |= parts("a", R.as_euler("xyz", degrees=True))
+    columns |= parts("fg", sensor.inv().apply(tumble["site"]) / 9.80665)
+    table = pyarrow.table({name: values for name, values in columns.items()})
+    pyarrow.parquet.write_table(table, tmp_path / "log.parquet")
+    order = POSE.replace('"r.0", "r.1", "r.2", "r.3"', '"r.1", "r.2", "r.3", "r.0"').replace("wxyz", "xyzw")
+    for tables in ((order, BODY), (ANGLES,)):
+        data = imported(tmp_path / "log.parquet", robot, *tables).data
+        torch.testing.assert_close(data.q, reference.q, rtol=0.0, atol=EXACT)
+        torch.testing.assert_close(data.qd, reference.qd, rtol=0.0, atol=EXACT)
+    torch.testing.assert_close(data.qdd, reference.qdd, rtol=0.0, atol=1e-6)  # 1e-9 over 1 ms
+
+
+@pytest.mark.parametrize("method", ["savitzky_golay", "smoother"])
+@pytest.mark.parametrize("logged", ["base", "joints", "none"])
+def test_velocities_that_are_not_logged_are_computed(
+    tmp_path: Path, robot: forcegp.RobotModel, tumble: dict[str, np.ndarray], logged: str, method: str
+) -> None:
+    columns = columns_of(tumble) | parts("qd", tumble["qvel"][:, 6:], ("hip", "knee"))
+    path = written(tmp_path / "log.csv", columns)
+    velocity = '[velocity]\ncolumn = "qd.{joint}"\nunit = "rad/s"\n' if logged == "joints" else ""
+    head = f'method = "{method}"\n'
+    toml = JOINTS.replace("[derivatives]\n", f"{velocity}[derivatives]\n{head}") + POSE
+    toml += VELOCITY if logged == "base" else ""
+    data = import_log(path, robot, parse_mapping(toml.encode(), "m.toml")).data
+    rates, _ = euler_motion(data.q[:, 3:6], tumble["qvel"][:, 3:6], tumble["qacc"][:, 3:6])
+    inner, truth = slice(20, -20), tumble["qvel"].copy()
+    truth[:, 3:6] = rates
+    own = {"base": [0, 1, 2], "joints": [6, 7], "none": []}[logged]
+    np.testing.assert_allclose(data.qd[:, own], truth[:, own], atol=EXACT)
+    error = np.abs(data.qd.numpy() - truth)[inner].max(axis=0) / np.abs(truth).max(axis=0)
+    assert data.extras["qdd_std"].isfinite().all()
+    assert (error < FILTERED).all()
+    assert set(data.header.derived) == {"qd", "qdd"}
+
+
+def test_motion_of_pinocchio(tmp_path: Path) -> None:
+    if pin is None:
+        pytest.skip("Pinocchio is not installed")
+    arm = next(arm for arm in ARMS if arm.name == "anymal_kinova")
+    robot, model = arm.load(base="free"), pin.buildModelFromUrdf(str(arm.path), pin.JointModelFreeFlyer())
+    data, random = model.createData(), np.random.default_rng(1)
+    twist = random.normal(size=model.nv)
+    twist[:6] = [0.3, -0.4, 0.5, 1.2, 0.6, -2.0]
+    start, names = pin.neutral(model), robot.joint_names[6:]
+    start[:7] = [1.0, 2.0, 3.0, *Rotation.from_euler("xyz", [0.3, -0.2, 0.5]).as_quat()]
+    joints = [model.joints[model.getJointId(name)] for name in names]
+    frame, base = model.getFrameId("imu_link"), model.getFrameId("base")
+    g = robot.gravity.numpy()
+    local, aligned = pin.ReferenceFrame.LOCAL, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+    rows, truth, t = [], [], DT * np.arange(500)
+    for at in t:
+        # With q = q₀ ⊕ s(t) V, the twist of the base is ṡ V in its own axes.
+        s, ds, dds = at + 0.1 * np.sin(3.0 * at), 1.0 + 0.3 * np.cos(3.0 * at), -0.9 * np.sin(3.0 * at)
+        q = pin.integrate(model, start, s * twist)
+        pin.forwardKinematics(model, data, q, ds * twist, dds * twist)
+        pin.updateFramePlacements(model, data)
+        f = pin.getFrameClassicalAcceleration(model, data, frame, local).linear
+        f = f - data.oMf[frame].rotation.T @ g
+        gyro = pin.getFrameVelocity(model, data, frame, local).angular
+        angles = [q[j.idx_q] if j.nq == 1 else np.arctan2(q[j.idx_q + 1], q[j.idx_q]) for j in joints]
+        rows.append([at, *q[:7], *(ds * twist[:3]), *gyro, *f, *angles])
+        speed, speeding = (
+            read(model, data, base, aligned)
+            for read in (pin.getFrameVelocity, pin.getFrameClassicalAcceleration)
+        )
+        R = data.oMf[base].rotation
+        truth.append([*speed.linear, *(R.T @ speed.angular), *speeding.linear, *(R.T @ speeding.angular)])
+    log, true = np.array(rows), np.array(truth)
+    columns = {"t": t, **parts("p", log[:, 1:]), **parts("r", log[:, 4:], "0123"), **parts("v", log[:, 8:])}
+    columns |= {**parts("g", log[:, 11:]), **parts("f", log[:, 14:])}
+    columns |= parts("q", log[:, 17:], names) | parts("tau", np.zeros((len(t), len(names))), names)
+    linear = VELOCITY.replace("world", "body")
+    tables = POSE.replace("wxyz", "xyzw"), linear, SENSOR.replace('"imu"', '"imu_link"')
+    result = imported(written(tmp_path / "log.csv", columns), robot, *tables).data
+    np.testing.assert_allclose(result.q[:, :3], log[:, 1:4], atol=EXACT)
+    R = Rotation.from_quat(log[:, 4:8]).as_matrix()
+    np.testing.assert_allclose(torch.func.vmap(turn)(result.q), R, atol=EXACT)
+    rates, second = euler_motion(result.q[:, 3:6], true[:, 3:6], true[:, 9:])
+    np.testing.assert_allclose(result.qd[:, :3], true[:, :3], atol=EXACT)
+    np.testing.assert_allclose(result.qd[:, 3:6], rates, atol=EXACT)
+    turning = filter_error(rates.numpy(), second.numpy())
+    np.testing.assert_allclose(result.qdd[:, 3:6], second, atol=turning + EXACT)
+    print(turning, np.abs(result.qdd[:, :3].numpy() - true[:, 6:9]).max())
+
+
+def test_uneven_clocks_and_other_steps(
+    tmp_path: Path, robot: forcegp.RobotModel, tumble: dict[str, np.ndarray]
+) -> None:
+    path = written(tmp_path / "log.csv", columns_of(tumble))
+    toml = JOINTS.replace('"t"', '"t"\nperiod = 0.002') + POSE + VELOCITY
+    data = import_log(path, robot, parse_mapping(toml.encode(), "m.toml")).data
+    assert len(data) == 600
+    np.testing.assert_allclose(data.qd[:, :3], tumble["qvel"][::2, :3], atol=EXACT)
+    np.testing.assert_allclose(data.q[:, :3], tumble["qpos"][::2, :3], atol=EXACT)
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "message"),
+    [
+        (
+            'quaternion_order = "wxyz"\n',
+            "",
+            r"m.toml:\d+: base.quaternion: key 'quaternion_order' is missing",
+        ),
+        ('linear_axes = "world"\n', "", r"base.linear_velocity: key 'linear_axes' is missing"),
+        ("gravity = true\n", "", r"base.accelerometer: key 'gravity' is missing"),
+        ('imu_frame = "imu"\n', "", r"base.gyro: key 'imu_frame' is missing"),
+        ('imu_frame = "imu"', 'imu_frame = "foot"', r"'foot' is not fixed to the base(?s:.*)moved by 'knee'"),
+        ('imu_frame = "imu"', 'imu_frame = "imo"', r"'imo' is not a frame of the robot"),
+        ("gyro =", 'angular_axes = "body"\nangular_velocity =', None),
+        ('position = ["p.x", "p.y", "p.z"]\n', "", r"base: one source of the position is needed"),
+        ("quaternion = [", 'rpy = ["r.0", "r.1", "r.2"]\nquaternion = [', r"one orientation is needed"),
+        ("gyro =", 'angular_axes = "body"\nangular_velocity = ["w.x", "w.y", "w.z"]\ngyro =', "one angular"),
+        ('"p.x"', '"pp.x"', r"no column 'pp.x'"),
+    ],
+)
+def test_mappings_that_are_incomplete(
+    tmp_path: Path,
+    robot: forcegp.RobotModel,
+    tumble: dict[str, np.ndarray],
+    before: str,
+    after: str,
+    message: str | None,
+) -> None:
+    path = written(tmp_path / "log.csv", {name: x[:50] for name, x in columns_of(tumble).items()})
+    tables = POSE + VELOCITY + SENSOR
+    assert before in tables
+    if message is None:
+        imported(path, robot, tables.replace(before, after))
+        return
+    with pytest.raises((MappingError, DataError), match=message):
+        imported(path, robot, tables.replace(before, after))
+
+
+def test_a_robot_without_a_free_base_is_named(tmp_path: Path, tumble: dict[str, np.ndarray]) -> None:
+    (tmp_path / "fixed.xml").write_text(MODEL.replace('<freejoint name="root"/>', ""))
+    fixed = forcegp.load_robot(tmp_path / "fixed.xml")
+    path = written(tmp_path / "log.csv", columns_of(tumble))
+    with pytest.raises(MappingError, match=r"base: the robot has no joint 'base_x'(?s:.*)base=\"free\""):
+        imported(path, fixed, POSE)
+    free = forcegp.load_robot(tmp_path / "fixed.xml", base="free")
+    with pytest.raises(MappingError, match=r"joint 'base_x' has no column(?s:.*)a table \[base\]"):
+        import_log(
+            path, free, parse_mapping(JOINTS.replace("[base]", '[joints]\nhip = "hip"').encode(), "m.toml")
+        )
+
+
+def test_quaternions_that_are_not_rotations(
+    tmp_path: Path, robot: forcegp.RobotModel, tumble: dict[str, np.ndarray]
+) -> None:
+    columns = columns_of(tumble)
+    columns["r.0"] = columns["r.0"].copy()
+    columns["r.0"][700:703] += 0.3
+    with pytest.raises(DataError, match=r"log.csv: the quaternion of the base (?s:.*)rows 700 to 702"):
+        imported(written(tmp_path / "log.csv", columns), robot, POSE)
+    columns["r.0"][700:703] = np.nan
+    path = written(tmp_path / "log.csv", columns)
+    with pytest.raises(DataError, match=r"log.csv: values are missing or not finite in rows 700 to 702"):
+        imported(path, robot, POSE)
+    toml = (JOINTS + POSE).replace('column = "t"', 'column = "t"\nmissing = "drop"')
+    data = import_log(path, robot, parse_mapping(toml.encode(), "m.toml")).data
+    assert len(data) == len(tumble["t"]) - 3
+    assert bool(data.q.isfinite().all())
+
+
+def test_a_pitch_near_90_degrees_is_named(tmp_path: Path, robot: forcegp.RobotModel) -> None:
+    t = DT * np.arange(2000)
+    pitch = np.pi * t  # passes 90° in row 500 and 270° in row 1500
+    columns = {"t": t, **parts("p", np.zeros((2000, 3)))}
+    columns |= parts("r", np.roll(Rotation.from_euler("y", pitch[:, None]).as_quat(), 1, axis=1), "0123")
+    columns |= parts("q", np.zeros((2000, 2)), ("hip", "knee")) | parts(
+        "tau", np.zeros((2000, 2)), ("hip", "knee")
+    )
+    result = imported(written(tmp_path / "log.csv", columns), robot, POSE)
+    (finding,) = [found for found in result.report.findings if found.kind == "singular"]
+    assert [(a <= k <= b) for (a, b), k in zip(finding.rows, (500, 1500), strict=True)] == [True, True]
+    assert finding.count == len(t) - len(result.data)
+    segment = result.data.segment
+    assert segment is not None
+    assert int(segment.max()) == 2
+    assert float(result.data.qd[:, 4].abs().max()) == pytest.approx(np.pi, rel=1e-6)
+    upright = {name: x[:20] if name != "r.2" else np.full(20, np.sqrt(0.5)) for name, x in columns.items()}
+    upright["r.0"] = upright["r.2"]
+    with pytest.raises(DataError, match=r"pitch of the base comes near ±90° in rows 0 to 19"):
+        imported(written(tmp_path / "log.csv", upright), robot, POSE)
+    # Two rows on both sides of the singularity
+    fast = {name: x[::250] for name, x in columns.items()} | {"t": DT * np.arange(8)}
+    fast = {name: np.tile(x, 10) for name, x in fast.items()} | {"t": DT * np.arange(80)}
+
+
+def test_a_wrong_gravity_is_found(
+    tmp_path: Path, robot: forcegp.RobotModel, tumble: dict[str, np.ndarray]
+) -> None:
+    path = written(tmp_path / "log.csv", columns_of(tumble))
+    report = imported(path, robot, POSE, VELOCITY, SENSOR.replace("true", "false")).report
+    assert [found.kind for found in report.findings] == ["accelerometer"]
+    assert "off the motion of the base by 9.8" in report.findings[0].message
