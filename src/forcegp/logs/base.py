@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 from forcegp import kinematics
 from forcegp.errors import DataError
 from forcegp.logs import units
+from forcegp.logs.compensated import CHUNK
 from forcegp.logs.mapping import BaseSection, Mapping
 from forcegp.logs.smoothing import above_zero, filtered
 from forcegp.logs.table import Array, ImportReport, Signals
@@ -116,8 +117,10 @@ def place_base(signals: Signals, robot: RobotModel, mapping: Mapping, report: Im
         return
     slides, turns = _indices(signals)
     B = robot.base_rotation.numpy()
-    turned = B.T @ Rotation.from_quat(vectors.pop(ORIENTATION)).as_matrix()
-    vectors["q"][:, turns] = _angles(turned)
+    R = B.T @ Rotation.from_quat(vectors.pop(ORIENTATION)).as_matrix()
+    if section.orientation_of == "imu":
+        R = R @ _sensor(robot, section)[0].T
+    vectors["q"][:, turns] = _angles(R)
     _drop_singular(signals, turns, report)
     for rows in signals.runs():
         vectors["q"][rows, turns[0] : turns[-1] + 1] = np.unwrap(vectors["q"][rows][:, turns], axis=0)
@@ -186,28 +189,30 @@ def _stand(signals: Signals, robot: RobotModel, section: BaseSection, report: Im
         report.find("flight", text, signals.row[~standing])
         signals.keep(standing, split=True)
         rest = rest[standing]
-    q = vectors["q"].copy()
-    q[:, _indices(signals)[0]] = -robot.base_position.numpy() @ robot.base_rotation.numpy()
-    poses = kinematics.link_poses(robot, torch.from_numpy(q))
-    r = np.stack(
-        [
-            kinematics.pose_of_frame(robot, poses, robot.frame_index(frame))[1].numpy()
-            for frame in section.feet
-        ],
-        axis=1,
-    )
-    r += robot.base_position.numpy()
+    r = _feet(signals, robot, section)
     both = (rest[1:] & rest[:-1]).astype(float)
-    signals.segment = signals.segment + np.append(0, np.cumsum(both.sum(axis=1) == 0.0))
+    alone = (both.sum(axis=1) == 0.0) & (np.diff(signals.segment) == 0)
+    signals.segment = signals.segment + np.append(0, np.cumsum(alone))
     step = -(both[..., None] * np.diff(r, axis=0)).sum(axis=1) / np.maximum(both.sum(axis=1), 1.0)[:, None]
-    vectors[POSITION] = np.zeros((len(signals), 3))
+    p = np.zeros((len(signals), 3))
     for rows in signals.runs():
-        first = rows.start
-        vectors[POSITION][first, 2] = -r[first, rest[first], 2].mean()
-        vectors[POSITION][first + 1 : rows.stop] = vectors[POSITION][first] + np.cumsum(
-            step[first : rows.stop - 1], axis=0
-        )
-    report.steps.append(f"computed positions of the base from rest of {', '.join(section.feet)}")
+        first, last = rows.start, rows.stop
+        p[first, 2] = -r[first, rest[first], 2].mean()
+        p[first + 1 : last] = p[first] + np.cumsum(step[first : last - 1], axis=0)
+    vectors[POSITION] = p
+    report.steps.append(f"computed positions of the base from feet at rest: {', '.join(section.feet)}")
+
+
+def _feet(signals: Signals, robot: RobotModel, section: BaseSection) -> Array:
+    """Return positions of the feet relative to the base, in axes of the world (n, feet, 3) [m]."""
+    q, frames = signals.vectors["q"].copy(), [robot.frame_index(frame) for frame in section.feet]
+    q[:, _indices(signals)[0]] = 0.0
+    chunks = []
+    for first in range(0, len(q), CHUNK):
+        poses = kinematics.link_poses(robot, torch.from_numpy(q[first : first + CHUNK]))
+        places = [kinematics.pose_of_frame(robot, poses, frame)[1].numpy() for frame in frames]
+        chunks.append(np.stack(places, axis=1))
+    return np.concatenate(chunks)
 
 
 def _drop_singular(signals: Signals, turns: list[int], report: ImportReport) -> None:

@@ -272,14 +272,15 @@ class BaseSection(Section):
     `acceleration_unit`. `rpy` are roll, pitch and yaw with R = R_z R_y R_x, as the joints of a free base.
 
     `imu_position` [m] and `imu_rpy` [rad] place the sensor in `imu_frame`. With `gravity`, an accelerometer
-    at rest reads +g along the upward axis. Without `position`, the base is carried by feet at rest: `feet`
-    names the column that flags the contact of each such frame.
+    at rest reads +g along the upward axis. Without `position`, feet at rest determine it: `feet` names the
+    column of each frame that is 1 while this foot does not move.
     """
 
     position: Triple | None = None
     quaternion: tuple[str, str, str, str] | None = None
     quaternion_order: Literal["wxyz", "xyzw"] | None = None
     rpy: Triple | None = None
+    orientation_of: Literal["base", "imu"] = "base"
     linear_velocity: Triple | None = None
     linear_axes: Literal["world", "body"] | None = None
     angular_velocity: Triple | None = None
@@ -502,6 +503,8 @@ def _check_base(mapping: Mapping, base: BaseSection) -> None:
     if base.angular_velocity is not None and base.gyro is not None:
         expected = "angular_velocity = […], or gyro = […] with imu_frame"
         raise mapping.error(("base", "gyro"), "one angular velocity is needed", expected)
+    if base.orientation_of == "imu" and base.imu_frame is None:
+        raise mapping.error(("base", "orientation_of"), "key 'imu_frame' is missing", "a frame of the robot")
     for given, needed, choice in (
         ("quaternion", "quaternion_order", '"wxyz" or "xyzw"'),
         ("linear_velocity", "linear_axes", '"world" or "body"'),
