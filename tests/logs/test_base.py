@@ -473,3 +473,94 @@ def test_feet_at_rest_carry_the_base(tmp_path: Path) -> None:
     columns |= {"FL": np.zeros(n), "HR": np.zeros(n)}
     with pytest.raises(DataError, match="no foot is at rest in any row"):
         imported(written(tmp_path / "air.csv", columns), robot, *tables)
+
+
+def bag_of(folder: Path, log: dict[str, np.ndarray]) -> Path:
+    """A ROS 2 bag with joint states at 500 Hz, odometry at 250 Hz and an IMU at 1 kHz."""
+    writer = pytest.importorskip("rosbags.rosbag2").Writer
+    typesys = pytest.importorskip("rosbags.typesys")
+    store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
+    types = {name.rpartition("/")[2]: kind for name, kind in store.types.items() if "/msg/" in name}
+    kinds = {"JointState": "sensor_msgs", "Odometry": "nav_msgs", "Imu": "sensor_msgs"}
+
+    def vector(x: np.ndarray, kind: str = "Vector3") -> object:
+        return types[kind](*map(float, x))
+
+    with writer(folder / "bag", version=9) as bag:
+        topics = {
+            kind: bag.add_connection(f"/{kind.lower()}", f"{package}/msg/{kind}", typestore=store)
+            for kind, package in kinds.items()
+        }
+        for k, t in enumerate(log["t"]):
+            ns = 1_700_000_000_000_000_000 + round(1e9 * float(t))
+            stamp = types["Time"](sec=ns // 10**9, nanosec=ns % 10**9)
+            header, no = types["Header"](stamp=stamp, frame_id=""), np.zeros(36)
+            p, r = vector(log["qpos"][k, :3], "Point"), vector(log["qpos"][k, [4, 5, 6, 3]], "Quaternion")
+            R = Rotation.from_quat(log["qpos"][k, [4, 5, 6, 3]])
+            v, w = vector(R.inv().apply(log["qvel"][k, :3])), vector(log["qvel"][k, 3:6])
+            f, g = vector(log["sensor"][k, :3]), vector(log["sensor"][k, 3:6])
+            messages = {
+                "JointState": types["JointState"](
+                    header, ["hip", "knee"], log["qpos"][k, 7:], log["qvel"][k, 6:], log["tau"][k]
+                ),
+                "Odometry": types["Odometry"](
+                    header,
+                    "trunk",
+                    types["PoseWithCovariance"](types["Pose"](p, r), no),
+                    types["TwistWithCovariance"](types["Twist"](v, w), no),
+                ),
+                "Imu": types["Imu"](header, r, no[:9], g, no[:9], f, no[:9]),
+            }
+            for kind, every in (("JointState", 2), ("Odometry", 4), ("Imu", 1)):
+                if k % every == 0:
+                    raw = store.serialize_cdr(messages[kind], f"{kinds[kind]}/msg/{kind}")
+                    bag.write(topics[kind], ns + 1000, raw)
+    return folder / "bag"
+
+
+ROS = """
+[time]
+column = "header"
+[position]
+column = "position.{joint}"
+unit = "rad"
+[velocity]
+column = "velocity.{joint}"
+unit = "rad/s"
+[torque]
+column = "effort.{joint}"
+unit = "Nm"
+[base]
+stream = "/odometry"
+imu_stream = "/imu"
+position = ["pose.pose.position.x", "pose.pose.position.y", "pose.pose.position.z"]
+quaternion = [
+    "pose.pose.orientation.x", "pose.pose.orientation.y",
+    "pose.pose.orientation.z", "pose.pose.orientation.w",
+]
+quaternion_order = "xyzw"
+linear_velocity = ["twist.twist.linear.x", "twist.twist.linear.y", "twist.twist.linear.z"]
+linear_axes = "body"
+imu_frame = "imu"
+gyro = ["angular_velocity.x", "angular_velocity.y", "angular_velocity.z"]
+accelerometer = ["linear_acceleration.x", "linear_acceleration.y", "linear_acceleration.z"]
+gravity = true
+"""
+
+
+def test_streams_of_ros(tmp_path: Path, robot: forcegp.RobotModel, tumble: dict[str, np.ndarray]) -> None:
+    result = import_log(bag_of(tmp_path, tumble), robot, parse_mapping(ROS.encode(), "m.toml"))
+    data, rows = result.data, slice(0, 1197, 2)
+    assert len(data) == 599
+    # Odometry of every fourth row is interpolated linearly onto every second row, the IMU is exact.
+    p, v = tumble["qpos"][rows, :3], tumble["qvel"][rows]
+    h = 4.0 * DT
+    np.testing.assert_allclose(data.q[:, :3], p, atol=h**2 / 8.0 * np.abs(tumble["qacc"][:, :3]).max())
+    np.testing.assert_allclose(data.q[::2, :3], p[::2], atol=EXACT)
+    R = Rotation.from_quat(tumble["qpos"][rows][:, [4, 5, 6, 3]])
+    turned = Rotation.from_matrix(torch.func.vmap(turn)(data.q).numpy())
+    assert (turned.inv() * R).magnitude().max() < h**2 / 8.0 * np.linalg.norm(
+        tumble["qacc"][:, 3:6], axis=1
+    ).max()
+    rates, _ = euler_motion(data.q[:, 3:6], v[:, 3:6], v[:, 3:6])
+    np.testing.assert_allclose(data.qd[:, 3:6], rates, atol=EXACT)

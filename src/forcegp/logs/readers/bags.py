@@ -1,10 +1,11 @@
 """Reader of ROS 1 and ROS 2 bags and MCAP files that needs no ROS installation.
 
 Joint states become the columns `position.<joint>`, `velocity.<joint>` and `effort.<joint>`. Wrenches become
-the columns `force.x` to `torque.z`. Both also have the columns `header`, the time stamp of the driver [s],
-and `receive`, the time of recording [s]. Each is relative to the earliest one in the log, since float64
-cannot resolve nanoseconds since 1970. Message layouts are those of the ROS distributions, and definitions
-stored in a bag are not compiled.
+the columns `force.x` to `torque.z`, and vectors of odometry and of an IMU columns with the path of the field,
+such as `pose.pose.orientation.x`. All also have the columns `header`, the time stamp of the driver [s], and
+`receive`, the time of recording [s]. Each is relative to the earliest one in the log, since float64 cannot
+resolve nanoseconds since 1970. Message layouts are those of the ROS distributions, and definitions stored in
+a bag are not compiled.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from functools import cache
 from itertools import groupby
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -27,9 +29,23 @@ from forcegp.logs.table import Column, LogTable, Progress, Stream, Wanted
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
 WRENCH = "geometry_msgs/msg/WrenchStamped"
-KINDS = (JOINT_STATE, WRENCH)  # that are read
+_TWIST, _POSE = "twist.twist", "pose.pose"
+FIELDS: dict[str, dict[str, str]] = {
+    WRENCH: {"wrench.force": "force", "wrench.torque": "torque"},
+    "nav_msgs/msg/Odometry": {
+        path: path
+        for path in (f"{_POSE}.position", f"{_POSE}.orientation", f"{_TWIST}.linear", f"{_TWIST}.angular")
+    },
+    "sensor_msgs/msg/Imu": {
+        path: path for path in ("orientation", "angular_velocity", "linear_acceleration")
+    },
+}
+"""Vectors and quaternions that are read from a message, and the first part of their columns."""
+KINDS = (JOINT_STATE, *FIELDS)
+"""Types of messages that are read."""
 UNITS = {"position": "rad", "velocity": "rad/s", "effort": "Nm", "force": "N", "torque": "Nm"}
 """Units in joint states (REP 103) and in wrenches."""
+STAMPS = ("header", "receive")
 
 Found = tuple[str, str, str, int, bytes, int]
 """Topic, type, encoding, recording time [ns] and content of a message, and amount of data read so far."""
@@ -74,7 +90,8 @@ class Messages:
         for column, numbers in zip(self.columns, values, strict=True):
             if not np.isnan(numbers).all() and wanted(column):
                 columns[column] = numbers
-        return Stream(name, columns, {c: UNITS.get(c.partition(".")[0], "s") for c in columns})
+        named = {c: "s" if c in STAMPS else UNITS.get(c.partition(".")[0]) for c in columns}
+        return Stream(name, columns, {c: unit for c, unit in named.items() if unit is not None})
 
 
 @dataclass
@@ -104,8 +121,13 @@ class Collector:
         if kind == JOINT_STATE:
             values = _joint_state(self.unpacking.source, topic, message)
         else:
-            parts = {"force": message.wrench.force, "torque": message.wrench.torque}
-            values = {f"{part}.{axis}": getattr(x, axis) for part, x in parts.items() for axis in "xyz"}
+            parts = {part: attrgetter(path)(message) for path, part in FIELDS[kind].items()}
+            values = {
+                f"{part}.{axis}": getattr(x, axis)
+                for part, x in parts.items()
+                for axis in "xyzw"
+                if hasattr(x, axis)
+            }
         stream = self._streams.setdefault((topic, frozenset(values)), Messages(topic, tuple(values)))
         stamp = message.header.stamp
         stream.rows.append([values[column] for column in stream.columns])
@@ -151,7 +173,7 @@ def _joint_state(source: str, topic: str, message: Any) -> dict[str, float]:
 
 
 def read_bag(path: Path, *, wanted: Wanted, rows: int | None, progress: Progress | None) -> LogTable:
-    """Read the joint states and wrenches in a ROS 1 bag, a ROS 2 bag or an MCAP file."""
+    """Read the supported messages in a ROS 1 bag, a ROS 2 bag or an MCAP file."""
     files = _files(path) if path.is_dir() else [path]
     unpacking = Unpacking(str(path), sum(file.stat().st_size for file in files))
     collector, topics = Collector(unpacking), dict[str, str]()
