@@ -198,6 +198,35 @@ acceleration_unit = "g"
 """
 
 
+def test_a_base_that_is_placed_in_the_world(
+    tmp_path: Path, robot: forcegp.RobotModel, tumble: dict[str, np.ndarray]
+) -> None:
+    (tmp_path / "hopper.xml").write_text(MODEL)
+    pose = {"base_position": (1.0, -2.0, 3.0), "base_rpy": (0.3, -0.2, 0.5)}
+    placed = forcegp.load_robot(tmp_path / "hopper.xml", base="free", **pose)
+    columns = columns_of(tumble)
+    R = Rotation.from_quat(tumble["qpos"][:, [4, 5, 6, 3]])
+    columns |= parts("vb", R.inv().apply(tumble["qvel"][:, :3]))
+    columns |= parts("ww", R.apply(tumble["qvel"][:, 3:6]))
+    path = written(tmp_path / "log.csv", columns)
+    gyro, rest = SENSOR.split("\n")[1], SENSOR.replace(SENSOR.split("\n")[1] + "\n", "")
+    assert gyro.startswith("gyro")
+    there, here = (imported(path, model, POSE, BODY, rest).data for model in (placed, robot))
+    for frame in ("foot", "trunk"):
+        poses = [
+            forcegp.kinematics.frame_pose(model, data.q, frame)
+            for model, data in ((placed, there), (robot, here))
+        ]
+        torch.testing.assert_close(poses[0], poses[1], rtol=0.0, atol=EXACT)
+        speeds = [
+            (forcegp.kinematics.frame_jacobian(model, data.q, frame) @ data.qd[..., None])[..., 0]
+            for model, data in ((placed, there), (robot, here))
+        ]
+        torch.testing.assert_close(speeds[0], speeds[1], rtol=0.0, atol=EXACT)
+    forces = forcegp.dynamics.inverse_dynamics(placed, there.q, there.qd, there.qdd)
+    assert float(forces[:, :6].abs().max()) < 1e-3 * float(robot.mass.sum() * robot.gravity.norm())
+
+
 def sensor_in_base() -> Rotation:
     """Orientation of the site in MuJoCo's model."""
     model = mujoco.MjModel.from_xml_string(MODEL)
