@@ -18,6 +18,7 @@ from forcegp.errors import DataError, MappingError
 from forcegp.logs import Imported, ImportReport, import_log, parse_mapping
 from forcegp.logs.base import IMU
 from forcegp.logs.gather import gather
+from forcegp.logs.guess import guess_mapping
 from free_flyer import HOPPER, body_velocity, turn
 from pinocchio_oracle import pin
 from robots import ARMS
@@ -593,3 +594,44 @@ def test_streams_of_ros(tmp_path: Path, robot: forcegp.RobotModel, tumble: dict[
     ).max()
     rates, _ = euler_motion(data.q[:, 3:6], v[:, 3:6], v[:, 3:6])
     np.testing.assert_allclose(data.qd[:, 3:6], rates, atol=EXACT)
+
+
+@pytest.mark.parametrize("order", ["wxyz", "xyzw"])
+@pytest.mark.parametrize("axes", ["world", "body"])
+def test_a_mapping_is_proposed(
+    tmp_path: Path, robot: forcegp.RobotModel, tumble: dict[str, np.ndarray], order: str, axes: str
+) -> None:
+    log = {name: x[:500] for name, x in tumble.items()}
+    R = Rotation.from_quat(log["qpos"][:, [4, 5, 6, 3]])
+    quaternion = log["qpos"][:, 3:7] if order == "wxyz" else R.as_quat()
+    v, w = log["qvel"][:, :3], log["qvel"][:, 3:6]
+    columns = {"t": log["t"], **parts("base_pos", log["qpos"]), **parts("base_quat", quaternion, "0123")}
+    columns |= parts("base_lin_vel", v if axes == "world" else R.inv().apply(v))
+    columns |= parts("base_ang_vel", w if axes == "world" else R.apply(w))
+    columns |= parts("pos", log["qpos"][:, 7:], ("hip", "knee")) | parts(
+        "vel", log["qvel"][:, 6:], ("hip", "knee")
+    )
+    columns |= parts("tau", log["tau"], ("hip", "knee"))
+    path = written(tmp_path / "log.csv", columns)
+    draft = guess_mapping(path, forcegp.ConstrainedSystem(robot))
+    base = draft.further["base"]
+    assert (base["quaternion_order"], base["linear_axes"]) == (order, axes)
+    assert base["angular_axes"] == {"world": "body", "body": "world"}[axes]
+    data = import_log(path, robot, parse_mapping(draft.toml().encode(), "m.toml")).data
+    np.testing.assert_allclose(data.qd[:, :3], v, atol=EXACT)
+    np.testing.assert_allclose(data.qd[:, 6:], log["qvel"][:, 6:], atol=EXACT)
+
+
+def test_a_mapping_is_proposed_for_ros(
+    tmp_path: Path, robot: forcegp.RobotModel, tumble: dict[str, np.ndarray]
+) -> None:
+    path = bag_of(tmp_path, tumble)
+    draft = guess_mapping(path, forcegp.ConstrainedSystem(robot))
+    base = draft.further["base"]
+    assert (base["quaternion_order"], base["linear_axes"]) == ("xyzw", "body")
+    assert (base["imu_frame"], base["imu_stream"], base["stream"]) == ("imu", "/imu", "/odometry")
+    ours, theirs = (
+        import_log(path, robot, parse_mapping(toml.encode(), "m.toml")).data for toml in (draft.toml(), ROS)
+    )
+    torch.testing.assert_close(ours.q, theirs.q, rtol=0.0, atol=EXACT)
+    torch.testing.assert_close(ours.qd[:, 3:], theirs.qd[:, 3:], rtol=0.0, atol=EXACT)

@@ -27,7 +27,7 @@ from forcegp.logs.clock import even_clock
 from forcegp.logs.compensated import restore, subtracted
 from forcegp.logs.contact import force_levels, multiplier
 from forcegp.logs.gather import gather
-from forcegp.logs.headings import find_families, find_time, find_wrench, tokens
+from forcegp.logs.headings import find_base, find_families, find_time, find_wrench, tokens
 from forcegp.logs.mapping import (
     ROWS,
     Compensated,
@@ -42,6 +42,7 @@ from forcegp.logs.readers import read
 from forcegp.logs.smoothing import add_derivatives
 from forcegp.logs.table import Array, ImportReport, LogTable, Progress, Signals, Stream
 from forcegp.robot import RobotModel
+from forcegp.robot.free_base import BASE_JOINTS
 from forcegp.robust import level_and_spread
 from forcegp.rows import runs
 
@@ -69,10 +70,15 @@ def guess_mapping(path: str | Path, system: ConstrainedSystem, progress: Progres
     table = read(path, rows=ROWS, progress=progress)
     draft = Draft(str(path), remarks=table.remarks)
     with foreign(str(path), "a log that can be imported"):
+        table = find_base(table, system.robot, draft)
         stream = find_time(table, draft)
-        find_families(stream, system.robot, draft)
+        based = BASE_JOINTS if "base" in draft.further else ()
+        joints = tuple(joint for joint in system.robot.joint_names if joint not in based)
+        find_families(stream, joints, draft)
         find_wrench(table, system.robot, draft)
-        possible = _position_units(stream, draft, system.robot) if draft.families["position"].columns else []
+        possible = (
+            _position_units(stream, draft, system.robot, joints) if draft.families["position"].columns else []
+        )
         for quantity, family in draft.families.items():
             if draft.incomplete and not family.unit:
                 family.unit = possible[0] if quantity == "position" and possible else units.SI[quantity]
@@ -88,20 +94,21 @@ def guess_mapping(path: str | Path, system: ConstrainedSystem, progress: Progres
     return draft
 
 
-def _position_units(stream: Stream, draft: Draft, robot: RobotModel) -> list[str]:
+def _position_units(stream: Stream, draft: Draft, robot: RobotModel, joints: tuple[str, ...]) -> list[str]:
     """Return the units of the positions that their values and the joint limits permit, likeliest first."""
     family = draft.families["position"]
     if family.declared and family.unit is not None:
         return [family.unit]
-    columns = draft.columns_of("position", robot.joint_names)
-    reach = np.array([np.nanmax(np.abs(stream.columns[columns[joint]])) for joint in robot.joint_names])
+    columns = draft.columns_of("position", joints)
+    reach = np.array([np.nanmax(np.abs(stream.columns[columns[joint]])) for joint in joints])
     draft.say("position", f"values up to {reach.max():.4g}")
     limit = torch.maximum(robot.lower.abs(), robot.upper.abs()).numpy()
+    limit = limit[np.isin(robot.joint_names, joints)]
     limit = np.where(np.isfinite(limit), limit, MOST_RADIANS)
     beyond = reach > BEYOND_LIMIT * limit
     if reach.max() > MOST_RADIANS or beyond[reach.argmax()]:
         k = int(reach.argmax())
-        text = f"values of {robot.joint_names[k]} up to {reach[k]:.4g} exceed {limit[k]:.3g} rad: degrees"
+        text = f"values of {joints[k]} up to {reach[k]:.4g} exceed {limit[k]:.3g} rad: degrees"
         draft.say("position", text, doubt=bool(np.radians(reach[k]) > BEYOND_LIMIT * limit[k]))
         return ["deg"]
     return ["rad"] + ["deg"] * (not reach.max() < LEAST_DEGREES)
@@ -191,7 +198,8 @@ def _signals(path: str | Path, draft: Draft, system: ConstrainedSystem, without:
 def _velocity_unit(draft: Draft, trial: Signals) -> None:
     """Infer the unit and sign of the velocity from its slope against the derivative of the position."""
     family = draft.families["velocity"]
-    q, qd = trial.vectors["q"], trial.vectors["qd"]
+    own = _own(draft, trial)
+    q, qd = trial.vectors["q"][:, own], trial.vectors["qd"][:, own]
     inner = np.flatnonzero(trial.segment[2:] == trial.segment[:-2]) + 1
     rate = (q[inner + 1] - q[inner - 1]) / (trial.t[inner + 1] - trial.t[inner - 1])[:, None]
     slopes = (rate * qd[inner]).sum(axis=0) / np.maximum((rate**2).sum(axis=0), 1e-300)
@@ -213,7 +221,7 @@ def _velocity_unit(draft: Draft, trial: Signals) -> None:
     else:
         family.unit = unit
         draft.say("velocity", f"{unit}: {slope:.3g} times the derivative of the position in rad/s")
-    family.sign = _signs(slopes, moving, trial.joint_names)
+    family.sign = _signs(slopes, moving, np.array(trial.joint_names)[own])
     if family.sign != 1.0:
         turned = "all joints" if family.sign == -1.0 else "some joints"
         draft.say("velocity", f"the velocity of {turned} is minus the derivative of the position", doubt=True)
@@ -231,22 +239,28 @@ def _time_unit(draft: Draft, slope: float) -> str | None:
     return best if best != unit and 1.0 / NEAR < off[best] < NEAR else None
 
 
-def _signs(slopes: Array, clear: np.ndarray, joints: tuple[str, ...]) -> float | dict[str, float]:
+def _own(draft: Draft, trial: Signals) -> NDArray[np.bool_]:
+    """Return the mask (nq,) of the joints with columns of their own, other than those of a free base."""
+    return ~np.isin(trial.joint_names, BASE_JOINTS if "base" in draft.further else ())
+
+
+def _signs(slopes: Array, clear: np.ndarray, joints: NDArray[np.str_]) -> float | dict[str, float]:
     """Return one sign for all joints, or one per joint if they differ."""
     negative = slopes[clear] < 0.0
     if negative.all() and clear.any():
         return -1.0
     if not negative.any():
         return 1.0
-    return {j: -1.0 if c and s < 0.0 else 1.0 for j, s, c in zip(joints, slopes, clear, strict=True)}
+    return {str(j): -1.0 if c and s < 0.0 else 1.0 for j, s, c in zip(joints, slopes, clear, strict=True)}
 
 
 def _torque(draft: Draft, trial: Signals, system: ConstrainedSystem) -> None:
     """Infer the sign and unit of the torque by comparing it with the inverse dynamics."""
-    family = draft.families["torque"]
-    slopes, correlation = torque_slopes(trial, system)
+    family, own = draft.families["torque"], _own(draft, trial)
+    joints = np.array(trial.joint_names)[own]
+    slopes, correlation = (x[own] for x in torque_slopes(trial, system))
     clear = np.abs(correlation) > 0.5
-    listing = ", ".join(f"{j} {c:+.2f}" for j, c in zip(trial.joint_names, correlation, strict=True))
+    listing = ", ".join(f"{j} {c:+.2f}" for j, c in zip(joints, correlation, strict=True))
     draft.say("torque", f"correlation with the robot's inverse dynamics: {listing}")
     named = {"current", "currents"}.intersection(tokens(family.pattern))
     if current := family.unit in units.CURRENT or (bool(named) and not family.declared):
@@ -255,7 +269,7 @@ def _torque(draft: Draft, trial: Signals, system: ConstrainedSystem) -> None:
         draft.say("torque", text, doubt=True)
     measured = len(clear) - len(family.unmeasured)
     if (share := gravity_share(trial, system)) < LACKING:
-        lighter, follows = torque_slopes(trial, system, "gravity")
+        lighter, follows = (x[own] for x in torque_slopes(trial, system, "gravity"))
         if (np.abs(follows) > 0.5).sum() >= min(clear.sum(), 0.5 * measured):
             slopes, clear, family.compensated = lighter, np.abs(follows) > 0.5, "gravity"
             draft.say(
@@ -263,7 +277,7 @@ def _torque(draft: Draft, trial: Signals, system: ConstrainedSystem) -> None:
             )
     if clear.sum() < 0.5 * measured:
         return _remainder(draft, trial, correlation)
-    family.sign = _signs(slopes, clear, trial.joint_names)
+    family.sign = _signs(slopes, clear, joints)
     if isinstance(family.sign, dict):
         draft.say("torque", "the sign differs between joints; are the joints in the right order?", doubt=True)
     elif clear.sum() < len(clear) - len(family.unmeasured):
@@ -278,7 +292,8 @@ def _torque(draft: Draft, trial: Signals, system: ConstrainedSystem) -> None:
 
 def _remainder(draft: Draft, trial: Signals, correlation: Array) -> None:
     """Propose `compensated = "model"` for torques that friction explains, and their sign: drives push."""
-    family, qd, tau = draft.families["torque"], trial.vectors["qd"], trial.vectors["tau"]
+    family, own = draft.families["torque"], _own(draft, trial)
+    qd, tau = trial.vectors["qd"][:, own], trial.vectors["tau"][:, own]
     work, explained = np.zeros(qd.shape[1]), np.zeros(qd.shape[1])
     for i in range(qd.shape[1]):
         columns = np.column_stack([np.ones(len(qd)), qd[:, i], np.tanh(qd[:, i] / SHARPEST)])
@@ -290,7 +305,7 @@ def _remainder(draft: Draft, trial: Signals, correlation: Array) -> None:
     few = (explained > 0.5).sum() < 0.5 * (len(work) - len(family.unmeasured))
     if few or (correlation**2).mean() > UNRELATED:
         return draft.say("torque", "few torques follow the inverse dynamics: sign unknown", doubt=True)
-    family.sign = _signs(work, explained > 0.5, trial.joint_names)
+    family.sign = _signs(work, explained > 0.5, np.array(trial.joint_names)[own])
     family.compensated = "model"
     draft.say("torque", "friction explains it: the driver seems to subtract a model", doubt=True)
 

@@ -7,19 +7,23 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from dataclasses import replace
 from difflib import SequenceMatcher
 from functools import cache
 from itertools import permutations
 from os.path import commonprefix
+from typing import Any
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
+from scipy.spatial.transform import Rotation
 
 from forcegp.errors import MappingError
 from forcegp.logs import units
 from forcegp.logs.mapping import Draft, Family
 from forcegp.logs.table import LogTable, Stream
 from forcegp.robot import RobotModel
+from forcegp.robot.free_base import BASE_JOINTS
 from forcegp.robust import robust_std
 
 WORDS: dict[str, list[str]] = units.VOCABULARY["words"]
@@ -48,6 +52,8 @@ LOGGED, DAY = (5e-5, 0.1), 86_400.0
 COMMAND_SHARE = 0.6
 """Weight of the columns of a stream that is named like a command."""
 _AXES = (("force", "f"), ("torque", "m", "t", "moment"))
+ROWS_OF_AXES = 20_000
+"""Maximum number of rows from which the axes of a velocity are inferred."""
 _SEGMENTS = ("segment", "episode_index", "episode", "trial", "run")
 
 
@@ -192,9 +198,9 @@ def doubtful(name: str) -> str | None:
     return next((f"{kind} ({word!r})" for kind, word in found), None)
 
 
-def find_families(stream: Stream, robot: RobotModel, draft: Draft) -> None:
+def find_families(stream: Stream, joints: tuple[str, ...], draft: Draft) -> None:
     """Find the columns of each quantity and the log's joint names; leave empty what is not recognised."""
-    numbered, alike = _families(stream, robot), _alike(stream, robot)
+    numbered, alike = _families(stream, joints), _alike(stream, joints)
     for quantity in WORDS:
         rated = _rated(numbered, quantity, stream) or _rated(alike, quantity, stream)
         if rated:
@@ -208,9 +214,9 @@ def find_families(stream: Stream, robot: RobotModel, draft: Draft) -> None:
                 if (reason := doubtful(name)) is not None:
                     draft.say(quantity, named_like(name, reason, quantity), doubt=True)
     if not draft.families:
-        find_by_values(stream, robot.joint_names, draft)
-    _match_joints(robot, draft)
-    _partly_measured(stream, robot, draft)
+        find_by_values(stream, joints, draft)
+    _match_joints(joints, draft)
+    _partly_measured(stream, joints, draft)
     for quantity, family in draft.families.items():
         if len(valid := _units(family, stream) & set(units.QUANTITY[quantity])) == 1:
             family.unit, family.declared = valid.pop(), True
@@ -221,20 +227,20 @@ def find_families(stream: Stream, robot: RobotModel, draft: Draft) -> None:
     unused = ", ".join(column for column in stream.columns if column not in used) or "(none)"
     for quantity in ("position", "torque"):
         if quantity not in draft.families:
-            empty = dict.fromkeys(robot.joint_names, "")
+            empty = dict.fromkeys(joints, "")
             draft.families[quantity] = Family("", {}, stream.name, units.SI[quantity], by_joint=empty)
             text = f"no {quantity} was recognised: fill in columns and unit; unused columns: {unused[:300]}"
             draft.say(quantity, text + draft.left_out, doubt=True)
 
 
-def _partly_measured(stream: Stream, robot: RobotModel, draft: Draft) -> None:
+def _partly_measured(stream: Stream, joints: tuple[str, ...], draft: Draft) -> None:
     """Take a torque that is logged for some of the joints; the others are unmeasured."""
     position = draft.families.get("position")
     if "torque" in draft.families or position is None:
         return
-    called = draft.joints or dict(zip(robot.joint_names, robot.joint_names, strict=True))
+    called = draft.joints or dict(zip(joints, joints, strict=True))
     names = {joint: name for joint, name in called.items() if name in position.columns}
-    some = [f for f in _families(stream, robot, partly=True) if set(f.columns) < set(names.values())]
+    some = [f for f in _families(stream, joints, partly=True) if set(f.columns) < set(names.values())]
     if rated := _rated(some, "torque", stream):
         draft.families["torque"] = best = rated[0]
         best.by_joint = {j: best.columns[name] for j, name in names.items() if name in best.columns}
@@ -243,10 +249,10 @@ def _partly_measured(stream: Stream, robot: RobotModel, draft: Draft) -> None:
         draft.say("torque", f"no torque of {listing}: unmeasured, which means an unknown force", doubt=True)
 
 
-def _families(stream: Stream, robot: RobotModel, partly: bool = False) -> list[Family]:
+def _families(stream: Stream, joints: tuple[str, ...], partly: bool = False) -> list[Family]:
     """Return groups of columns that differ in a joint name or a number, for all joints or for some."""
     groups: dict[str, dict[str, str]] = {}
-    names = "|".join(re.escape(name) for name in sorted(robot.joint_names, key=len, reverse=True))
+    names = "|".join(re.escape(name) for name in sorted(joints, key=len, reverse=True))
     for column in stream.columns:
         joint = re.search(names, column) or re.search(names, column, re.I)
         for found in [*([joint] if joint else []), *re.finditer(r"\d+", column)]:
@@ -254,20 +260,22 @@ def _families(stream: Stream, robot: RobotModel, partly: bool = False) -> list[F
             groups.setdefault(pattern, {})[found[0]] = column
             if found is joint and _quantity(pattern) is not None:
                 break
-    complete = ((p, of) for p, of in groups.items() if len(of) == robot.nq or (partly and len(of) < robot.nq))
+    complete = (
+        (p, of) for p, of in groups.items() if len(of) == len(joints) or (partly and len(of) < len(joints))
+    )
     return [Family(pattern, of, stream.name) for pattern, of in complete]
 
 
-def _alike(stream: Stream, robot: RobotModel) -> list[Family]:
+def _alike(stream: Stream, joints: tuple[str, ...]) -> list[Family]:
     """Return groups of nq columns with the same unit and the same known words, such as `az_deg`, `el_deg`."""
-    if robot.nq == 1:
-        return [Family(column, {robot.joint_names[0]: column}, stream.name) for column in stream.columns]
+    if len(joints) == 1:
+        return [Family(column, {joints[0]: column}, stream.name) for column in stream.columns]
     groups: dict[object, list[str]] = {}
     for column in stream.columns:
         key = declared_unit(column, stream), *sorted(_KNOWN.intersection(tokens(column)))
         groups.setdefault(key, []).append(column)
     result = []
-    for columns in (columns for columns in groups.values() if len(columns) == robot.nq):
+    for columns in (columns for columns in groups.values() if len(columns) == len(joints)):
         turned = [column[::-1] for column in columns]
         start, end = (re.sub("[A-Za-z0-9]*$", "", commonprefix(x)) for x in (columns, turned))  # noqa: RUF071
         names = {column[len(start) : len(column) - len(end)]: column for column in columns}
@@ -298,21 +306,21 @@ def _rated(families: list[Family], quantity: str, stream: Stream) -> list[Family
     return [family for score, family in sorted(scored, key=lambda pair: -pair[0]) if score > 0.0]
 
 
-def _match_joints(robot: RobotModel, draft: Draft) -> None:
+def _match_joints(joints: tuple[str, ...], draft: Draft) -> None:
     """Match the robot's joints to the names that the log uses for its positions or, without them, torques."""
     families = sorted(draft.families.items(), key=lambda item: item[0] != "position")
     for quantity, family in families:
         names = list(family.columns)
-        if set(names) == set(draft.joints.values() or robot.joint_names):
+        if set(names) == set(draft.joints.values() or joints):
             continue
         if all(name.isdigit() for name in names):
             order, how = sorted(names, key=int), "numbered joints were taken from base to tip"
         else:
-            likeness = np.array([[_likeness(j, name) for name in names] for j in robot.joint_names])
+            likeness = np.array([[_likeness(j, name) for name in names] for j in joints])
             # Among equally similar names, the order in the log decides; the user is asked to check it.
             order = [names[k] for k in linear_sum_assignment(-likeness - 0.3 * np.eye(len(names)))[1]]
             how = "joint names were matched by similarity"
-        matched = dict(zip(robot.joint_names, order, strict=True))
+        matched = dict(zip(joints, order, strict=True))
         first = family is families[0][1]
         draft.say("joints" if first else quantity, f"{quantity}: {how}", doubt=True)
         if first:
@@ -346,6 +354,126 @@ def find_wrench(table: LogTable, robot: RobotModel, draft: Draft) -> None:
             unknown = "the sensor's frame, its sign (acts_on) and the tool's weight are not in the log"
             draft.say("wrench", unknown, doubt=True)
             return
+
+
+_VECTOR = re.compile(r"(?i)^(.+?)[ ._\[/]*q?([xyzw]|[0-3])\]?$")
+_OF_BASE = {"base", "root", "trunk", "torso", "pelvis", "floating", "body", "pose", "twist", "odom"}
+_ROLES: tuple[tuple[str, int, set[str], set[str]], ...] = (
+    ("quaternion", 4, {"quat", "quaternion", "orientation", "rot"}, set()),
+    (
+        "accelerometer",
+        3,
+        {"accelerometer", "acc", "accel", "acceleration"},
+        {"accelerometer", "imu", "linear"},
+    ),
+    ("gyro", 3, {"gyro", "gyroscope"}, set()),
+    ("angular_velocity", 3, {"ang", "angular", "omega"}, _OF_BASE),
+    ("gyro", 3, {"angular", "ang", "omega"}, {"velocity", "vel", "imu"}),
+    ("linear_velocity", 3, {"linear", "lin", "vel", "velocity"}, _OF_BASE),
+    ("position", 3, {"pos", "position", "xyz"}, _OF_BASE),
+)
+"""Keys of `[base]`: number of components, words of which one is needed, and further such words."""
+
+
+def find_base(table: LogTable, robot: RobotModel, draft: Draft) -> LogTable:
+    """Propose `[base]` for the columns of a free base and of an IMU, and return the log without them."""
+    found = [(stream, _vectors(stream)) for stream in table.streams]
+    of_base = next(((s, of) for s, of in found if {"position", "quaternion"} <= set(of)), None)
+    if BASE_JOINTS[-1] not in robot.joint_names or of_base is None:
+        return table
+    stream, vectors = of_base
+    of_imu = next(((s, of) for s, of in found if not {"gyro", "accelerometer"}.isdisjoint(of)), None)
+    base: dict[str, object] = {k: [*vectors[k].values()] for k in ("position", "quaternion")}
+    base |= {"stream": stream.name or None, "quaternion_order": "xyzw"}
+    if "w" not in vectors["quaternion"]:
+        base["quaternion_order"] = order = _order(stream, vectors["quaternion"])
+        draft.say("base", f"the base is upright for a quaternion in the order {order}", doubt=True)
+    if of_imu is not None:
+        base |= _imu(*of_imu, robot, draft)
+    rates = "linear_velocity", *(() if "gyro" in base else ("angular_velocity",))
+    for key in (key for key in rates if key in vectors):
+        axes, clear = _axes(stream, vectors, key, str(base["quaternion_order"]))
+        base |= {key: [*vectors[key].values()], f"{key.partition('_')[0]}_axes": axes}
+        draft.say("base", f"{key} is the derivative of the pose in {axes} axes", doubt=not clear)
+    draft.further["base"] = base
+    listed = (value for value in base.values() if isinstance(value, list))
+    used = {column for columns in listed for column in columns}
+    streams = (
+        replace(s, columns={name: x for name, x in s.columns.items() if name not in used})
+        for s in table.streams
+    )
+    return replace(table, streams=tuple(streams))
+
+
+def _vectors(stream: Stream) -> dict[str, dict[str, str]]:
+    """Return the columns of each vector of a base or an IMU, by component and in the order x, y, z, w."""
+    stems: dict[str, dict[str, str]] = {}
+    for column in stream.columns:
+        if (match := _VECTOR.match(column)) is not None:
+            stems.setdefault(match[1], {})[match[2].lower()] = column
+    vectors: dict[str, dict[str, str]] = {}
+    for stem, of in stems.items():
+        words = {*tokens(stem)}
+        for key, count, named, further in _ROLES:
+            more = not further or not words.isdisjoint(further)
+            if len(of) == count and not words.isdisjoint(named) and more and doubtful(stem) is None:
+                vectors.setdefault(key, dict(sorted(of.items(), key=lambda pair: "0123xyzw".index(pair[0]))))
+                break
+    return vectors
+
+
+def _rotations(stream: Stream, columns: dict[str, str], order: str) -> Rotation:
+    """Return the rotations of a quaternion with columns in the given order."""
+    values = np.stack([stream.columns[column] for column in columns.values()], axis=1)
+    values = np.roll(values, -1, axis=1) if order == "wxyz" else values
+    good = np.isfinite(values).all(axis=1) & (np.linalg.norm(values, axis=1) > 0.0)
+    return Rotation.from_quat(np.where(good[:, None], values, [0.0, 0.0, 0.0, 1.0]))
+
+
+def _order(stream: Stream, columns: dict[str, str]) -> str:
+    """Return the order of a quaternion without letters for which the base is more upright."""
+    return max(("wxyz", "xyzw"), key=lambda o: _rotations(stream, columns, o).as_matrix()[:, 2, 2].mean())
+
+
+def _axes(stream: Stream, vectors: dict[str, dict[str, str]], key: str, order: str) -> tuple[str, bool]:
+    """Return the axes in which a velocity is correlated with the changes of the pose, and whether clearly."""
+    p, v = (
+        np.stack([stream.columns[column] for column in vectors[name].values()], axis=1)[:ROWS_OF_AXES]
+        for name in ("position", key)
+    )
+    R = _rotations(stream, vectors["quaternion"], order)[:ROWS_OF_AXES]
+    moved = (
+        np.diff(p, axis=0) if key == "linear_velocity" else R[:-1].apply((R[:-1].inv() * R[1:]).as_rotvec())
+    )
+    alike = {"world": v[:-1], "body": R[:-1].apply(v[:-1])}
+    good = np.isfinite(moved).all(axis=1) & np.isfinite(v[:-1]).all(axis=1)
+    fits = {
+        axes: float(np.corrcoef(moved[good].ravel(), x[good].ravel())[0, 1]) if good.any() else 0.0
+        for axes, x in alike.items()
+    }
+    best, other = ("world", "body") if fits["world"] >= fits["body"] else ("body", "world")
+    return best, 1.0 - fits[best] < 0.5 * (1.0 - fits[other])
+
+
+def _imu(
+    stream: Stream, vectors: dict[str, dict[str, str]], robot: RobotModel, draft: Draft
+) -> dict[str, Any]:
+    """Return the keys of an IMU, with its frame by name and its gravity by the mean reading."""
+    at = robot.joint_names.index(BASE_JOINTS[-1])
+    frames = [
+        name for name, parent in zip(robot.frame_names, robot.frame_parents, strict=True) if parent == at
+    ]
+    frame = next((name for name in frames if "imu" in name.lower()), frames[0])
+    imu: dict[str, Any] = {"imu_frame": frame, "imu_stream": stream.name or None}
+    imu |= {key: [*vectors[key].values()] for key in ("gyro", "accelerometer") if key in vectors}
+    draft.say("base", f"the IMU was taken to have the pose of frame {frame}", doubt=True)
+    if "accelerometer" in vectors:
+        f = np.stack([stream.columns[column] for column in vectors["accelerometer"].values()], axis=1)
+        mean = float(np.linalg.norm(np.nanmean(f, axis=0)))
+        imu["gravity"] = mean > 0.5
+        imu["acceleration_unit"] = "g" if 0.5 < mean < 2.0 else "m/s2"
+        draft.say("base", f"the mean reading of the accelerometer is {mean:.3g}", doubt=True)
+    return imu
 
 
 def find_by_values(stream: Stream, joints: tuple[str, ...], draft: Draft) -> None:
