@@ -123,7 +123,7 @@ def place_base(signals: Signals, robot: RobotModel, mapping: Mapping, report: Im
     vectors["q"][:, turns] = _angles(R)
     _drop_singular(signals, turns, report)
     for rows in signals.runs():
-        vectors["q"][rows, turns[0] : turns[-1] + 1] = np.unwrap(vectors["q"][rows][:, turns], axis=0)
+        vectors["q"][rows, turns] = np.unwrap(vectors["q"][rows, turns], axis=0)
     if section.feet:
         _stand(signals, robot, section, report)
     R = _turn(vectors["q"][:, turns])
