@@ -162,8 +162,11 @@ def add_imu(
     measured, noise = filtered(signals.t, vectors.pop(IMU), piece, mapping.sections.derivatives)
     lever = _sensor(robot, section)[1]
     q, qd, qdd = (vectors[name][:, turns] for name in ("q", "qd", "qdd"))
-    w, dw = _spin(q, qd, qdd)
-    p = measured - _times(_turn(q), np.cross(dw, lever) + np.cross(w, np.cross(w, lever)))
+    (w, dw), R = _spin(q, qd, qdd), _turn(q)
+    p = measured - _times(R, np.cross(dw, lever) + np.cross(w, np.cross(w, lever)))
+    # p̈ = p̈_s − R (E α̈ × r) − …, so the noise of α̈ adds to that of the sensor
+    of_turns = R @ np.cross(_rate_matrix(q), lever, axisa=1, axisb=0, axisc=1)
+    noise = np.sqrt(noise**2 + _times(of_turns**2, std[:, turns] ** 2))
     off = np.linalg.norm((p - vectors["qdd"][:, slides]).mean(axis=0))
     if off > OFF * float(robot.gravity.norm()) > 0.0:
         text = f"the accelerometer is off the motion of the base by {off:.3g} m/s² on average"
@@ -273,8 +276,7 @@ def _spin(angles: Array, rates: Array, second: Array) -> tuple[Array, Array]:
     """Return ω = E α̇ and ω̇ = E α̈ + Ė α̇, (n, 3) each and in axes of the base."""
     _, pitch, roll = angles.T
     _, dpitch, droll = rates.T
-    (s, c), (sr, cr), zero, one = _sine(pitch), _sine(roll), np.zeros_like(pitch), np.ones_like(pitch)
-    E = np.array([[-s, zero, one], [c * sr, cr, zero], [c * cr, -sr, zero]]).transpose(2, 0, 1)
+    (s, c), (sr, cr), zero, E = _sine(pitch), _sine(roll), np.zeros_like(pitch), _rate_matrix(angles)
     dE = np.array(
         [
             [-c * dpitch, zero, zero],
@@ -283,6 +285,13 @@ def _spin(angles: Array, rates: Array, second: Array) -> tuple[Array, Array]:
         ]
     ).transpose(2, 0, 1)
     return _times(E, rates), _times(E, second) + _times(dE, rates)
+
+
+def _rate_matrix(angles: Array) -> Array:
+    """Return E (n, 3, 3)."""
+    (s, c), (sr, cr) = _sine(angles[:, 1]), _sine(angles[:, 2])
+    zero, one = np.zeros_like(s), np.ones_like(s)
+    return np.array([[-s, zero, one], [c * sr, cr, zero], [c * cr, -sr, zero]]).transpose(2, 0, 1)
 
 
 def _sine(x: Array) -> tuple[Array, Array]:
