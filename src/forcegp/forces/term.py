@@ -90,7 +90,7 @@ class PerJointPrior(ForcePrior):
     """A prior on one force per joint with E = I; subclasses may have a different operator.
 
     Forces of drives have E = Cᵀ, which is the identity unless drives are coupled. The joints of a free base
-    have no drive and no force.
+    have no drive, and therefore no such force and no remainder of it.
     """
 
     per_joint = True
@@ -105,7 +105,8 @@ class PerJointPrior(ForcePrior):
         return robot.nq
 
     def operator(self, system: ConstrainedSystem, at: States) -> Tensor:
-        E = torch.diag(system.robot.driven.to(at.q))
+        own = system.robot.driven if self._needs_drive else torch.ones_like(system.robot.driven)
+        E = torch.diag(own.to(at.q))
         E = system.robot.joint_torque(E).mT if self.of_drives else E
         return E.expand(len(at.q), -1, -1)
 
@@ -114,7 +115,11 @@ class PerJointPrior(ForcePrior):
             return super().applied(B, system, at)
         # B Cᵀ
         B = system.robot.drive_motion(B) if self.of_drives else B
-        return B * system.robot.driven
+        return B * system.robot.driven if self._needs_drive else B
+
+    @property
+    def _needs_drive(self) -> bool:
+        return self.of_drives or self.remainder
 
 
 class JointTerm(PerJointPrior):
