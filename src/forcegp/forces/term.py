@@ -105,7 +105,7 @@ class PerJointPrior(ForcePrior):
         return robot.nq
 
     def operator(self, system: ConstrainedSystem, at: States) -> Tensor:
-        own = system.robot.driven if self._needs_drive else torch.ones_like(system.robot.driven)
+        own = system.robot.driven if self.needs_drive else torch.ones_like(system.robot.driven)
         E = torch.diag(own.to(at.q))
         E = system.robot.joint_torque(E).mT if self.of_drives else E
         return E.expand(len(at.q), -1, -1)
@@ -115,10 +115,11 @@ class PerJointPrior(ForcePrior):
             return super().applied(B, system, at)
         # B Cᵀ
         B = system.robot.drive_motion(B) if self.of_drives else B
-        return B * system.robot.driven if self._needs_drive else B
+        return B * system.robot.driven if self.needs_drive else B
 
     @property
-    def _needs_drive(self) -> bool:
+    def needs_drive(self) -> bool:
+        """Whether joints without a drive have no such force."""
         return self.of_drives or self.remainder
 
 

@@ -28,7 +28,7 @@ from forcegp.forces.priors.constants import DrivePrior
 from forcegp.forces.priors.inertial import PER_PAYLOAD, InertialPrior, PayloadPrior
 from forcegp.forces.priors.joint import TERMS
 from forcegp.forces.quantities import PREDICTED, ROUNDED
-from forcegp.forces.term import JointTerm
+from forcegp.forces.term import JointTerm, PerJointPrior
 from forcegp.forces.unknowns import tip_keys
 from forcegp.gp import kernels
 from forcegp.gp.basis import KernelPart
@@ -381,7 +381,9 @@ class Writer:
         if not isinstance(
             prior, contact.ContactForcePrior | contact.SlidingFrictionPrior | contact.CoulombErrorPrior
         ):
-            return [f"  identity({part.components}, {E});"]
+            free = (~self.model.system.robot.driven).nonzero()[:, 0].tolist()
+            free = free if isinstance(prior, PerJointPrior) and prior.needs_drive else []
+            return [f"  identity({part.components}, {E});", *(f"  ({E})[{j}][{j}] = 0.0;" for j in free)]
         c = self.model.system.contact_names.index(prior.contact)
         if isinstance(prior, contact.CoulombErrorPrior):
             law = next(x for x in prior.friction if x.contact == prior.contact)
