@@ -32,6 +32,21 @@ def test_it_only_ever_dissipates_and_has_finite_slope_at_rest() -> None:
     assert bool(torch.isfinite(slope).all())
 
 
+def test_polynomial_damping_is_odd_and_that_of_the_drives() -> None:
+    """Of two drives, the second of which also moves with the first joint."""
+    robot, qd = forcegp.load_robot("double_pendulum"), torch.tensor([0.5, -2.0], dtype=torch.float64)
+    robot = robot.replace(drag=torch.tensor([[0.1, 0.2], [0.3, 0.4]], dtype=torch.float64))
+    coupled = robot.replace(coupling=torch.tensor([[1.0, 0.0], [1.0, 1.0]], dtype=torch.float64))
+    at_rest = robot.damping * 0.0
+    for each, speeds in ((robot, (0.5, -2.0)), (coupled, (0.5, -1.5))):
+        force = dynamics.damping_force(each.replace(damping=at_rest, friction=at_rest), qd)
+        first, second = (
+            -(b * abs(v) * v + c * v**3) for (b, c), v in zip(robot.drag.tolist(), speeds, strict=True)
+        )
+        expected = [first, second] if each is robot else [first + second, second]
+        torch.testing.assert_close(force, torch.tensor(expected, dtype=torch.float64))
+
+
 def test_robot_carries_its_friction() -> None:
     kuka, panda = forcegp.load_robot("kuka_iiwa"), forcegp.load_robot("franka_panda")
     qd = torch.randn(5, 7, generator=torch.Generator().manual_seed(0), dtype=torch.float64)

@@ -161,11 +161,10 @@ def bias_force(robot: RobotModel, q: JointVector, qd: JointVector) -> JointVecto
 def damping_force(robot: RobotModel, qd: JointVector, slip: JointVector | None = None) -> JointVector:
     """Return the viscous, Coulomb and Stribeck friction of the joints, `(*batch, nq)` [N m, N].
 
-    Q_D = −d q̇ − (f_c + f_s e^{−(q̇/v_s)²}) tanh(q̇/v_0), where tanh smooths friction near zero speed. If the
-    sliding direction `slip` `(*batch, nq)` is given, it replaces tanh(q̇/v_0). With coupled drives, q̇ are the
-    speeds of the drives. Source: Armstrong-Hélouvry et
-    al., *A survey of models, analysis tools and compensation methods for the control of machines with
-    friction* (1994).
+    Q_D = −(d + b |q̇| + c q̇²) q̇ − (f_c + f_s e^{−(q̇/v_s)²}) tanh(q̇/v_0), where tanh smooths friction near
+    zero speed. If the sliding direction `slip` `(*batch, nq)` is given, it replaces tanh(q̇/v_0). With coupled
+    drives, q̇ are the speeds of the drives. Source: Armstrong-Hélouvry et al., *A survey of models, analysis
+    tools and compensation methods for the control of machines with friction* (1994).
 
     Raises:
         ShapeError: qd has the wrong shape for the robot.
@@ -174,7 +173,10 @@ def damping_force(robot: RobotModel, qd: JointVector, slip: JointVector | None =
     v = robot.drive_motion(qd)
     dry = robot.friction + robot.stribeck * torch.exp(-((v / robot.stribeck_velocity) ** 2))
     along = torch.tanh(v / robot.friction_velocity) if slip is None else slip
-    return robot.joint_torque(-robot.damping * v - dry * along)
+    damping = robot.damping
+    if robot.drag is not None:
+        damping = damping + robot.drag[:, 0] * v.abs() + robot.drag[:, 1] * v * v
+    return robot.joint_torque(-damping * v - dry * along)
 
 
 def inverse_dynamics(robot: RobotModel, q: JointVector, qd: JointVector, qdd: JointVector) -> JointVector:

@@ -227,6 +227,7 @@ def mujoco_of(robot: forcegp.RobotModel) -> Any:
     model = mujoco.MjModel.from_xml_string(write_urdf(robot))
     model.opt.gravity[:], model.opt.timestep = robot.gravity.numpy(), 0.002
     model.dof_armature[:], model.dof_damping[:], model.dof_frictionloss[:] = robot.armature.numpy(), 0.7, 0.9
+    model.dof_dampingpoly[:] = 0.2, 0.1
     return model
 
 
@@ -254,6 +255,7 @@ def test_mujoco_accelerates_as_the_fit_predicts(fit: StructuredFit, sample: bool
     assert float((acceleration - predicted).abs().max()) < AGREEMENT * float(predicted.abs().max())
     assert mujoco.get_mjcb_passive() is None
     assert model.dof_damping.tolist() == [0.7, 0.7] and model.dof_frictionloss.tolist() == [0.9, 0.9]
+    assert model.dof_dampingpoly.tolist() == [[0.2, 0.1], [0.2, 0.1]]
 
 
 def test_mujoco_moves_as_the_rollout_under_the_learned_forces(fit: StructuredFit) -> None:
@@ -278,6 +280,12 @@ def test_joints_that_the_simulation_lacks_are_named(fit: StructuredFit) -> None:
         pytest.raises(UnknownNameError, match="wrist"),
         PassiveForces(fit.system, fit.force_field(), ["shoulder", "wrist"]).installed(model),
     ):
+        pass
+    spec = mujoco.MjSpec.from_string(write_urdf(fit.system.robot))
+    motor = spec.add_actuator(target="shoulder", trntype=mujoco.mjtTrn.mjTRN_JOINT)
+    motor.set_to_dcmotor([1.0, 1.0], 1.0, lugre=[90.0, 0.0, 1.0, 1.0, 0.1])
+    forces = PassiveForces(fit.system, fit.force_field())
+    with pytest.raises(ModelError, match=r"DC motor .* has LuGre friction"), forces.installed(spec.compile()):
         pass
 
 

@@ -89,8 +89,10 @@ def uncertain_inertia() -> StructuredFit:
 
 
 def one_contact() -> StructuredFit:
-    """Friction of the joints and, coupled with the multiplier, of a contact."""
-    system = forcegp.ConstrainedSystem(two_contacts().robot, two_contacts().contacts[:1], forcegp.Baumgarte())
+    """Friction of the joints, whose damping is polynomial, and, coupled with the multiplier, of a contact."""
+    robot = two_contacts().robot
+    robot = robot.replace(drag=robot.mass.new_tensor([[0.2, 0.3]]).expand(robot.nq, 2))
+    system = forcegp.ConstrainedSystem(robot, two_contacts().contacts[:1], forcegp.Baumgarte())
     noise = forcegp.Noise(0.1, torque=0.3, external={"lbr_iiwa_joint_2": 0.5})
     model = forcegp.StructuredGP(system, "analytical", friction_priors(system), noise=noise)
     return model.fit(logged(two_contacts(), 60), learn=[])

@@ -54,7 +54,7 @@ def assert_equal(robot: forcegp.RobotModel, path: Path, held: dict[str, float] |
         assert np.abs(ours - M[np.ix_(dofs, dofs)]).max() < RELATIVE * np.abs(M).max()
         bias = -(dynamics.bias_force(robot, q[k], qd[k]) + dynamics.gravity_force(robot, q[k])).numpy()
         assert np.abs(bias - data.qfrc_bias[dofs]).max() < RELATIVE * np.abs(data.qfrc_bias).max()
-        damping = -(robot.damping * qd[k]).numpy()
+        damping = dynamics.damping_force(robot.replace(friction=0.0 * robot.friction), qd[k]).numpy()
         assert np.abs(damping - data.qfrc_passive[dofs]).max() < RELATIVE * (1.0 + np.abs(damping).max())
 
 
@@ -132,9 +132,10 @@ def test_forces_of_tendons_that_are_ignored_are_named(tmp_path: Path) -> None:
 def test_what_the_reader_would_miss_is_found_by_the_comparison(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A polynomial damping of an actuator, and a reader that forgets armature, gravity or damping."""
-    poly = write(tmp_path, '<actuator><motor name="m" joint="b" damping="0.1 0.4"/></actuator>')
-    with pytest.raises(UnsupportedRobotError, match=r"damping of actuator 'm'|damping at joint 'b'"):
+    """Polynomial damping that couples joints, and a reader that forgets armature, gravity or damping."""
+    coupled = TENDON.format(kind="fixed", attribute="damping", path=COUPLED)
+    poly = write(tmp_path, coupled.replace('damping="0.3"', 'damping="0 0.3"'))
+    with pytest.raises(UnsupportedRobotError, match=r"damping of tendon 'belt' couples joints"):
         forcegp.load_robot(poly)
     path = write(tmp_path, '<actuator><motor name="m" joint="b" armature="0.1"/></actuator>')
     monkeypatch.setattr("forcegp.robot.mjcf._drives", lambda *_: iter(()))
@@ -306,6 +307,62 @@ def test_forces_that_a_flag_switches_off_are_zero(tmp_path: Path, flag: str, tex
     off = text == "damping"
     assert (robot.damping.item(), robot.friction.item()) == ((0.0, 0.5) if off else (5.0, 0.0))
     assert_equal(robot, path)
+
+
+POLYNOMIAL = """
+<default><joint damping="0.2 0.1 0.05"/></default>
+<tendon><fixed name="rope" damping="0.1 0.3 0.2"><joint joint="c" coef="-2"/></fixed></tendon>
+<actuator>
+  <motor joint="b" gear="-3" damping="0.1 -0.02 0.03" armature="0.1"/>
+  <motor tendon="rope" gear="3" damping="0.02 0.01 0.04"/>
+</actuator>"""
+
+
+def test_polynomial_damping_is_that_of_mujoco(tmp_path: Path) -> None:
+    """Of joints, of a default class, and of an actuator and a tendon with ratios; at random velocities."""
+    path = write(tmp_path, POLYNOMIAL)
+    robot, model = forcegp.load_robot(path), mujoco.MjModel.from_xml_path(str(path))
+    assert robot.damping.tolist() == pytest.approx([0.1, 1.1, 0.6 + 36 * 0.02])
+    assert robot.drag is not None
+    expected = [[0.1, 0.05], [0.1 - 9 * 0.02, 0.05 + 9 * 0.03], [2.5 + 72 * 0.01, 3.25 + 144 * 0.04]]
+    np.testing.assert_allclose(robot.drag.numpy(), expected, rtol=1e-14)
+    data = mujoco.MjData(model)
+    for qd in random_states(robot, 20)[1]:
+        data.qvel[:] = 3.0 * qd
+        mujoco.mj_forward(model, data)
+        force = dynamics.damping_force(robot, 3.0 * qd).numpy()
+        assert np.abs(force - data.qfrc_damper).max() < 1e-10 * np.abs(force).max()
+    assert_equal(robot, path)
+
+
+def test_lugre_friction_is_that_of_a_joint_that_keeps_sliding(tmp_path: Path) -> None:
+    """MuJoCo's DC motor, driven at constant speeds until its bristle is bent, with a gear."""
+    motor = '<dcmotor name="m" joint="b" input="none" motorconst="1e-9" resistance="1" gear="-2" lugre="{}"/>'
+    path = write(tmp_path, f"<actuator>{motor.format('300 1 0.4 0.7 0.1')}</actuator>")
+    with pytest.warns(RobotFileWarning, match="LuGre friction of actuator m is that of a joint that keeps"):
+        robot = forcegp.load_robot(path)
+    assert robot.bristle is not None
+    assert robot.bristle.tolist() == [0.0, 1200.0, 0.0]
+    model = mujoco.MjModel.from_xml_path(str(path))
+    data, sharp = mujoco.MjData(model), robot.replace(friction_velocity=0.0 * robot.mass + 1e-6)
+    for speed in (0.01, -0.04, 0.1, 0.5):
+        mujoco.mj_resetData(model, data)
+        for _ in range(round(0.1 / abs(speed) / model.opt.timestep)):
+            data.qpos[:], data.qvel[:] = 0.0, [0.0, speed, 0.0]
+            mujoco.mj_step(model, data)
+        data.qvel[:] = [0.0, speed, 0.0]
+        mujoco.mj_forward(model, data)
+        force = dynamics.damping_force(sharp, sharp.mass.new_tensor([0.0, speed, 0.0])).numpy()
+        np.testing.assert_allclose(force, data.qfrc_actuator, rtol=1e-10)
+    path = write(tmp_path, f"<actuator>{motor.format('300 1 0.4')}</actuator>")
+    with pytest.warns(RobotFileWarning):
+        assert not forcegp.load_robot(path).stribeck.any()
+    second = motor.replace('name="m"', 'name="n"').format("9 0 1 1 1")
+    path = write(tmp_path, f"<actuator>{motor.format('300 1 0.4')}{second}</actuator>")
+    with pytest.raises(
+        UnsupportedRobotError, match="joint 'b' has several kinds of dry friction with memory"
+    ):
+        forcegp.load_robot(path)
 
 
 def test_a_body_without_inertia_is_named_with_its_joint(tmp_path: Path) -> None:

@@ -5,12 +5,14 @@ import re
 from pathlib import Path
 
 import mujoco
+import numpy as np
 import pinocchio
 import pytest
 import torch
+from scipy.integrate import solve_ivp
 
 import forcegp
-from forcegp.errors import RobotFileError
+from forcegp.errors import RobotFileError, RobotFileWarning
 from forcegp.robot.edit_xml import EditableXml
 from forcegp.robot.inertia import from_pseudo_inertia, pseudo_inertia
 from forcegp.robot.load import robot_path
@@ -233,3 +235,101 @@ def test_mjcf_with_frames_unnamed_bodies_actuators_and_two_worldbodies(tmp_path:
     path.write_text(inside)
     with pytest.raises(RobotFileError, match="<inertial> of body 'body_1_' is inside a <frame>"):
         write_robot(changed(forcegp.load_robot(path), 0.02), path, out)
+
+
+CURVED = """<mujoco model="arm">
+  <option timestep="0.0002"/>
+  <default><joint damping="0.1 0.3 0.2"/></default>
+  <worldbody>
+    <body name="one" childclass="main">
+      <joint name="a" axis="0 1 0" armature="0.1" frictionloss="0.4"/>
+      <inertial pos="0.1 0 -0.3" mass="1" diaginertia="0.02 0.02 0.01"/>
+      <body name="two" pos="0 0 -0.5">
+        <joint axis="0 1 0" armature="0.1"/><inertial pos="0 0 -0.2" mass="1" diaginertia="0.02 0.02 0.01"/>
+      </body>
+    </body>
+  </worldbody>
+  <tendon><fixed name="t" frictionloss="0.1"><joint joint="a" coef="-2"/></fixed></tendon>
+  <actuator><motor joint="a" name="m"/><general joint="a" name="f" dyntype="filter" dynprm="0.1"/></actuator>
+  <keyframe><key qpos="0 0" act="0.5"/></keyframe>
+</mujoco>
+"""
+
+
+def bent(robot: RobotModel, **changes: list) -> RobotModel:
+    """A robot whose joints have dry friction with memory and polynomial damping."""
+    law = {"damping": [0.3, 0.2], "drag": [[0.0, 0.0], [-0.1, 0.3]], "friction": [1.5, 0.8]}
+    law |= {"stribeck": [0.5, 0.0], "stribeck_velocity": [0.2, 0.1], "bristle": [150.0, 40.0]} | changes
+    return robot.replace(**{name: torch.tensor(x, dtype=torch.float64) for name, x in law.items()})
+
+
+def test_mjcf_holds_polynomial_damping_and_friction_with_memory(tmp_path: Path) -> None:
+    """What MuJoCo simulates from the written file is M q̈ = Q with LuGre's bristles, by another integrator."""
+    path, out = tmp_path / "arm.xml", tmp_path / "out.xml"
+    path.write_text(CURVED)
+    robot = bent(forcegp.load_robot(path))
+    written = write_robot(robot, path, out)
+    assert written.losses == ()
+    changed = {(change.element, change.figure) for change in written.changes}
+    assert ("a", "stribeck") in changed and ("joint_1", "bristle") in changed
+    with pytest.warns(RobotFileWarning, match="LuGre friction"):
+        read = forcegp.load_robot(out)
+    for figure in ("damping", "drag", "friction", "stribeck", "bristle"):
+        torch.testing.assert_close(getattr(read, figure), getattr(robot, figure), rtol=SAME, atol=1e-12)
+    added = [line for line in differences(path, out) if line[0] == "+"]
+    assert len(added) == 7 and sum("<dcmotor" in line for line in added) == 2
+    model = mujoco.MjModel.from_xml_path(str(out))  # pyright: ignore[reportAttributeAccessIssue]
+    assert model.nu == 2 and model.actuator(1).name == "f"  # controls are those of the file
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_FRICTIONLOSS  # pyright: ignore[reportAttributeAccessIssue]
+    data = mujoco.MjData(model)  # pyright: ignore[reportAttributeAccessIssue]
+    mujoco.mj_resetDataKeyframe(model, data, 0)  # pyright: ignore[reportAttributeAccessIssue]
+    assert data.act.tolist() == [0.5, 0.0, 0.0]
+    data.act[:] = 0.0
+
+    def slope(t: float, x: np.ndarray) -> np.ndarray:
+        q, v, z = torch.from_numpy(x).view(3, 2)
+        # The tendon has 0.2 of the dry friction of the first joint, which is off here.
+        dry = robot.friction - robot.friction.new_tensor([0.2, 0.0])
+        g = dry + robot.stribeck * torch.exp(-((v / robot.stribeck_velocity) ** 2))
+        bend = v - robot.bristle * v.abs() / g * z
+        viscous = forcegp.dynamics.damping_force(robot.replace(friction=0.0 * v, stribeck=0.0 * v), v)
+        tau = viscous - robot.bristle * z + v.new_tensor([8.0 * np.sin(3.0 * t), 3.0 * np.sin(4.0 * t)])
+        return torch.cat([v, forcegp.dynamics.forward_dynamics(bare, q, v, tau), bend]).numpy()
+
+    bare = robot.replace(damping=0.0 * robot.damping, drag=None, friction=0.0 * robot.friction)
+    bare = bare.replace(stribeck=0.0 * robot.stribeck)
+    end = 1.5
+    solved = solve_ivp(slope, (0.0, end), np.zeros(6), rtol=1e-8, atol=1e-9, max_step=2e-3)
+    while data.time < end - 1e-9:
+        data.qfrc_applied[:] = 8.0 * np.sin(3.0 * data.time), 3.0 * np.sin(4.0 * data.time)
+        mujoco.mj_step(model, data)  # pyright: ignore[reportAttributeAccessIssue]
+    moved = np.abs(solved.y[:2]).max()
+    assert moved > 0.3  # rad, and the error is of the first order in the step of 0.2 ms
+    np.testing.assert_allclose(data.qpos, solved.y[:2, -1], atol=2e-3 * moved)
+
+    # Once more, into the file with the motors.
+    again = tmp_path / "again.xml"
+    write_robot(bent(read, stribeck=[0.0, 0.2], bristle=[90.0, 40.0]), out, again)
+    assert again.read_text().count("<dcmotor") == 2
+    with pytest.warns(RobotFileWarning):
+        assert forcegp.load_robot(again).bristle.tolist() == pytest.approx([90.0, 40.0])  # pyright: ignore
+
+
+def test_what_a_file_cannot_hold_of_friction_is_a_loss_or_refused(tmp_path: Path) -> None:
+    path, out = tmp_path / "arm.xml", tmp_path / "out.xml"
+    urdf = bent(forcegp.load_robot("double_pendulum"))
+    losses = write_robot(urdf, "double_pendulum", tmp_path / "out.urdf").losses
+    for figure in ("quadratic damping (0, -0.1)", "cubic damping (0, 0.3)", "stribeck (0.5, 0)", "bristle"):
+        assert any(f"does not support {figure}" in loss for loss in losses)
+    lugre = ' dyntype="dcmotor" gaintype="dcmotor" biastype="dcmotor" gainprm="1 1"'
+    lugre = lugre + ' dynprm="0 0 0 0 0 30" biasprm="0 0 0 1 1 1"'
+    path.write_text(CURVED.replace(' dyntype="filter" dynprm="0.1"', lugre))
+    with pytest.warns(RobotFileWarning):
+        robot = forcegp.load_robot(path)
+    with pytest.raises(RobotFileError, match="joint 'a' with LuGre friction cannot be edited"):
+        write_robot(bent(robot), path, out)
+    with (
+        pytest.warns(RobotFileWarning),
+        pytest.raises(RobotFileError, match="change the bristle of joint 'a'"),
+    ):
+        write_robot(robot.replace(bristle=None), path, out)

@@ -48,12 +48,14 @@ def test_newtons_equation_holds_with_the_solver_s_forces() -> None:
     assert wiping().acceleration_mismatch < NEWTON
 
 
-def test_the_acceleration_is_that_of_the_engines_motion() -> None:
+@pytest.mark.parametrize("drag", [0.0, 2.0])
+def test_the_acceleration_is_that_of_the_engines_motion(drag: float) -> None:
     """Also for a wrist whose viscous friction slows it within one step of the engine: h D/M = 0.6."""
     from forcegp.simulate.contact_solver import ContactSolverEngine
 
     h = 5e-4
-    engine = ContactSolverEngine(SYSTEM, h, replace(SCENE.simulation.solver, step=h))
+    robot = SYSTEM.robot.replace(drag=torch.full_like(SYSTEM.robot.axis[:, :2], drag))
+    engine = ContactSolverEngine(SYSTEM.with_robot(robot), h, replace(SCENE.simulation.solver, step=h))
     data = wiping().data
     for row in range(0, len(data), 50):
         engine.reset(data.q[row], data.qd[row])

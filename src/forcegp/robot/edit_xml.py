@@ -22,9 +22,9 @@ _TAG_NAME = re.compile(rb"<[^\s/>]+")
 @dataclass(eq=False)
 class Span:
     """An element in the text of a document: the end of its name (`head`), the end of its start tag (`close`),
-    whether it is written as `<tag/>`, the indentation of its line, and its attributes. For each attribute, it
-    contains the start and end of the quoted value, and the start of the attribute including the preceding
-    space.
+    whether it is written as `<tag/>`, the indentation of its line, the start of its end tag (`end`), and its
+    attributes. For each attribute, it contains the start and end of the quoted value, and the start of the
+    attribute including the preceding space.
     """
 
     tag: str
@@ -34,6 +34,7 @@ class Span:
     close: int
     empty: bool
     indent: bytes
+    end: int = 0
     children: list[Span] = field(default_factory=list)
 
     def find(self, tag: str) -> Span | None:
@@ -80,8 +81,11 @@ class EditableXml:
             (open_[-1].children if open_ else roots).append(element)
             open_.append(element)
 
+        def end(_: str) -> None:
+            open_.pop().end = parser.CurrentByteIndex
+
         parser.StartElementHandler = start
-        parser.EndElementHandler = lambda _: open_.pop()
+        parser.EndElementHandler = end
         parser.Parse(data, True)
         (self.root,) = roots
 
@@ -126,6 +130,11 @@ class EditableXml:
             self._edits.append((element.close - 2, element.close, b">" + closing))
         else:
             self._edits.append((element.close, element.close, added))
+
+    def append(self, element: Span, text: str) -> None:
+        """Insert XML as the last child of an element that has children."""
+        step, newline = element.children[0].indent, b"\r\n" if b"\r\n" in self._data else b"\n"
+        self._edits.append((element.end, element.end, step + text.encode() + newline + element.indent))
 
     def written(self) -> bytes:
         """Return the document with all changes applied."""

@@ -28,11 +28,19 @@ from forcegp.errors import (
 )
 from forcegp.robot.model import BASE, RobotModel
 from forcegp.robot.safety import parse_xml, read_bytes
-from forcegp.robot.tree import Base, Inertial, Joint, Tree, checked, joint_motion, lock_joints
+from forcegp.robot.tree import (
+    FRICTION_VELOCITY,
+    Base,
+    Drive,
+    Inertial,
+    Joint,
+    Tree,
+    checked,
+    joint_motion,
+    lock_joints,
+)
 from forcegp.robot.urdf import read_urdf
 
-FRICTION_VELOCITY = 0.1
-"""Default speed scale of Coulomb friction [rad/s, m/s], which robot files do not specify."""
 SINGULAR, WEIGHTLESS = 1e-12, 1e-10
 """Eigenvalue of the scaled mass matrix below which the matrix counts as singular in double precision; inertia
 of a joint below which it counts as zero, relative to the mass that it moves times its distance squared. Axes
@@ -45,8 +53,13 @@ LIMB_JOINTS, WALKING_JOINTS, BODY_MASS = 2, 6, 1.0
 (hands are lighter)."""
 GRAVITY, UNUSUAL = (0.0, 0.0, -9.81), 0.1
 """Gravitational acceleration unless the caller or the file states it; deviation that causes a note [m/s²]."""
-OF_JOINTS = ("axis", "damping", "friction", "armature", "lower", "upper", "velocity_limit", "effort_limit")
+OF_JOINTS = (
+    "axis", "damping", "friction", "stribeck", "stribeck_velocity", "armature", "lower", "upper",
+    "velocity_limit", "effort_limit",
+)  # fmt: skip
 """Joint attributes that are copied unchanged from the file."""
+OF_SOME = ("drag", "bristle")
+"""Those that are `None` if they are zero for all joints."""
 
 
 @dataclass(frozen=True)
@@ -72,15 +85,13 @@ def robot_of(tree: Tree, world: Mapping[str, np.ndarray]) -> RobotModel:
         warnings.warn(remark, RobotFileWarning, stacklevel=3)
     moving = placed.moving
     poses = {"placement": np.stack(placed.placements), "frame": np.stack([T for _, _, T in frames])}
-    speed = np.full(len(moving), FRICTION_VELOCITY)
     values = {
         **{name: [getattr(joint, name) for joint in moving] for name in OF_JOINTS},
         **{name: [getattr(body, name) for body in bodies] for name in ("mass", "com", "inertia")},
         **{f"{name}_rotation": T[:, :3, :3] for name, T in poses.items()},
         **{f"{name}_position": T[:, :3, 3] for name, T in poses.items()},
-        "stribeck": 0.0 * speed,
-        "stribeck_velocity": speed,
-        "friction_velocity": speed,
+        **{name: x for name in OF_SOME if np.any(x := [getattr(joint, name) for joint in moving])},
+        "friction_velocity": np.full(len(moving), FRICTION_VELOCITY),
         **world,
     }
     return RobotModel(
@@ -150,7 +161,8 @@ def _sum(bodies: list[Inertial]) -> Inertial:
 def _apply_drives(tree: Tree, placed: _Placed) -> list[str]:
     """Add drives that act on one moving joint to that joint. Return a note for each friction that is lost.
 
-    Armature and damping of other drives are left out, so `_compare` finds them.
+    Armature and damping of other drives are left out, so `_compare` finds them. With a ratio N, a force F(q̇)
+    of a drive acts on its joint as N F(N q̇).
     """
     index = {joint.name: i for i, joint in enumerate(placed.moving)}
     remarks = []
@@ -158,16 +170,37 @@ def _apply_drives(tree: Tree, placed: _Placed) -> list[str]:
         ratios = {index[name]: ratio for name, ratio in drive.ratios.items() if ratio and name in index}
         if len(ratios) == 1:
             ((i, ratio),) = ratios.items()
-            joint, square = placed.moving[i], ratio * ratio
-            placed.moving[i] = replace(
+            joint, size, square = placed.moving[i], abs(ratio), ratio * ratio
+            b, c = joint.drag
+            joint = replace(
                 joint,
                 armature=joint.armature + square * drive.armature,
                 damping=joint.damping + square * drive.damping,
-                friction=joint.friction + abs(ratio) * drive.friction,
+                friction=joint.friction + size * drive.friction,
+                drag=(b + size * square * drive.drag[0], c + square * square * drive.drag[1]),
             )
-        elif drive.friction and (ratios or not drive.ratios):
+            placed.moving[i] = _with_bristle(tree, joint, drive, size) if drive.lugre else joint
+        elif (drive.friction or drive.lugre) and (ratios or not drive.ratios):
             remarks.append(f"{tree.label}: the frictionloss of {drive.name} is ignored")
     return remarks
+
+
+def _with_bristle(tree: Tree, joint: Joint, drive: Drive, ratio: float) -> Joint:
+    """Return a joint with the dry friction with memory of a drive."""
+    if joint.bristle:
+        raise UnsupportedRobotError(
+            f"{tree.label}: joint {joint.name!r} has several kinds of dry friction with memory",
+            expected="at most one actuator with lugre for each joint",
+            got=drive.name,
+        )
+    stiffness, dry, static, speed = drive.lugre
+    return replace(
+        joint,
+        friction=joint.friction + ratio * dry,
+        stribeck=ratio * (static - dry),
+        stribeck_velocity=speed / ratio if speed else FRICTION_VELOCITY,
+        bristle=ratio * ratio * stiffness,
+    )
 
 
 def _check_mass_matrix(tree: Tree, placed: _Placed, bodies: list[Inertial]) -> None:
@@ -231,8 +264,8 @@ def _compare(tree: Tree, placed: _Placed, bodies: list[Inertial]) -> None:
         return
     random, moving = np.random.default_rng(0), placed.moving
     held = {joint.name: (joint.locked, 0.0) for joint in tree.joints if joint.locked is not None}
-    armature, damping = (
-        np.array([getattr(joint, name) for joint in moving]) for name in ("armature", "damping")
+    armature, damping, drag = (
+        np.array([getattr(joint, name) for joint in moving]) for name in ("armature", "damping", "drag")
     )
     for _ in range(COMPARED):
         q, qd, gravity = (random.uniform(-1.0, 1.0, n) for n in (len(moving), len(moving), 3))
@@ -240,11 +273,12 @@ def _compare(tree: Tree, placed: _Placed, bodies: list[Inertial]) -> None:
         theirs = tree.reference.equations(state | held, list(state), gravity)
         M, Q_G, _ = _rigid_body(placed, bodies, q, gravity)
         M += np.diag(armature)
-        scale = np.sqrt(np.diag(M))
+        scale, size = np.sqrt(np.diag(M)), np.abs(qd)
+        viscous = (damping + drag[:, 0] * size + drag[:, 1] * size**2) * qd
         checks = {
             "armature": np.abs(theirs[0] - M) / np.outer(scale, scale),
             "gravity": np.abs(theirs[1] - Q_G) / (np.abs(Q_G).max() + 1e-9),
-            "damping": np.abs(theirs[2] + damping * qd) / (np.abs(damping * qd).max() + 1e-9),
+            "damping": np.abs(theirs[2] + viscous) / (np.abs(viscous).max() + 1e-9),
         }
         for name, difference in checks.items():
             if difference.max() > DIFFERENT:
@@ -255,7 +289,7 @@ def _different(tree: Tree, moving: list[Joint], name: str, difference: np.ndarra
     """Return the error for a force or inertia in the file that the robot does not have."""
     names = {joint.name for joint in moving}
     acting = [d for d in tree.drives if not d.ratios or len(names & d.ratios.keys()) > 1]
-    among = [drive.name for drive in acting if getattr(drive, name, 0.0)]
+    among = [d.name for d in acting if getattr(d, name, 0.0) or (name == "damping" and any(d.drag))]
     joint = moving[int(np.unravel_index(difference.argmax(), difference.shape)[0])].name
     what = "mass matrix" if name == "armature" else name
     return UnsupportedRobotError(

@@ -51,7 +51,7 @@ def read_mjcf(root: Element, path: Path, base: Base = "fixed") -> Tree:
     """
     document, remarks = reduce_mjcf(root, path, base)
     with _warnings_of_mujoco(str(path), remarks):
-        model, gains = _compile(document, path)
+        model, gains, bristles = _compile(document, path)
         remarks += [f"{path}: {text} off by a flag" for text in _switched_off(model)]
     names = _names("body", [model.body(i).name for i in range(model.nbody)])
     joint_names = _names("joint", [model.joint(i).name for i in range(model.njnt)])
@@ -77,8 +77,8 @@ def read_mjcf(root: Element, path: Path, base: Base = "fixed") -> Tree:
         links=tuple(links),
         joints=tuple(joints),
         sites=sites,
-        remarks=(*remarks, *_tendon_forces(model, path)),
-        drives=tuple(_drives(model, joint_names, gains)),
+        remarks=(*remarks, *_tendon_forces(model, path), *_memory(model, bristles, path)),
+        drives=tuple(_drives(model, joint_names, gains, bristles)),
         gravity=(0.0, 0.0, 0.0) if weightless else tuple(model.opt.gravity.tolist()),
         reference=_Compiled(model, joint_names),
     )
@@ -178,16 +178,17 @@ def _warnings_of_mujoco(label: str, remarks: list[str]) -> Iterator[None]:
             mujoco.set_mju_user_warning(before)
 
 
-def _compile(document: Element, path: Path) -> tuple[Any, list[dict[str, float]]]:
-    """Return MuJoCo's model of the document without meshes, and the gains of its actuators.
+def _compile(document: Element, path: Path) -> tuple[Any, list[dict[str, float]], list[tuple[float, ...]]]:
+    """Return MuJoCo's model of the document without meshes, and the gains and bristles of its actuators.
 
     Raise typed errors with the compiler's text."""
     spec = None
     try:
         spec = mujoco.MjSpec.from_string(tostring(document, encoding="unicode"))
         _drop_meshes(spec, path)
+        bristles = [_bristle(actuator) for actuator in spec.actuators]
         gains = _reduce_constraints(spec, path)
-        return spec.compile(), gains
+        return spec.compile(), gains, bristles
     except (ValueError, RuntimeError, mujoco.FatalError) as error:
         if isinstance(error, UnsupportedRobotError):
             raise
@@ -263,6 +264,14 @@ def _reduce_constraints(spec: Any, path: Path) -> list[dict[str, float]]:
     return gains
 
 
+def _bristle(actuator: Any) -> tuple[float, ...]:
+    """Return σ₀, τ_c, τ_s and ω_s of the LuGre friction of a DC motor, or an empty tuple without."""
+    if actuator.dyntype != mujoco.mjtDyn.mjDYN_DCMOTOR or not actuator.dynprm[5] > 0.0:
+        return ()
+    dry, static, speed = (float(x) for x in actuator.biasprm[3:6])
+    return float(actuator.dynprm[5]), dry, static if speed > 0.0 else dry, speed
+
+
 def _couplings(model: Any, names: list[str], path: Path) -> dict[str, Coupling]:
     """Return y = y₀ + Σ aᵢ (x − x₀)ⁱ by the name of joint y. The references are the joints' `qpos0`."""
     coupled: dict[str, Coupling] = {}
@@ -279,7 +288,9 @@ def _couplings(model: Any, names: list[str], path: Path) -> dict[str, Coupling]:
     return coupled
 
 
-def _drives(model: Any, names: list[str], gains: list[dict[str, float]]) -> Iterator[Drive]:
+def _drives(
+    model: Any, names: list[str], gains: list[dict[str, float]], bristles: list[tuple[float, ...]]
+) -> Iterator[Drive]:
     """Yield the armature and damping of actuators and tendons, which act on the joints besides their own."""
     joint_types = int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT)
     tendons: list[dict[str, float]] = []
@@ -297,6 +308,7 @@ def _drives(model: Any, names: list[str], gains: list[dict[str, float]]) -> Iter
             _parameter(model, "tendon_armature", t),
             _parameter(model, "tendon_damping", t),
             _parameter(model, "tendon_frictionloss", t),
+            drag=_drag(model.tendon_dampingpoly[t]),
         )
     for a in range(model.nu):
         kind, target, gear = (
@@ -312,7 +324,16 @@ def _drives(model: Any, names: list[str], gains: list[dict[str, float]]) -> Iter
             _parameter(model, "actuator_armature", a),
             _parameter(model, "actuator_damping", a),
             gains=gains[a],
+            # MuJoCo multiplies all three coefficients by gear², at the speed of the joint or tendon.
+            drag=_drag(model.actuator_dampingpoly[a] / (np.array([abs(gear), gear**2]) if gear else 1.0)),
+            lugre=bristles[a],
         )
+
+
+def _drag(coefficients: np.ndarray) -> tuple[float, float]:
+    """Return b and c of the damping force (d + b |q̇| + c q̇²) q̇."""
+    quadratic, cubic = coefficients.tolist()
+    return quadratic, cubic
 
 
 def _parameter(model: Any, name: str, index: int) -> float:
@@ -328,6 +349,12 @@ def _tendon_forces(model: Any, path: Path) -> Iterator[str]:
         ignored = " and ".join(name for name, acts in forces.items() if acts)
         if ignored:
             yield f"{path}: the {ignored} of tendon {model.tendon(t).name or t!r} is ignored"
+
+
+def _memory(model: Any, bristles: list[tuple[float, ...]], path: Path) -> Iterator[str]:
+    """Yield a note on the friction with memory of actuators."""
+    for name in (model.actuator(a).name or repr(a) for a, bristle in enumerate(bristles) if bristle):
+        yield f"{path}: LuGre friction of actuator {name} is that of a joint that keeps sliding"
 
 
 def _pose(position: np.ndarray, quaternion: np.ndarray) -> np.ndarray:
@@ -369,8 +396,8 @@ def _joint(model: Any, j: int, name: str, body: str, follows: Coupling | None, l
         raise UnsupportedRobotError(text, expected="hinge and slide joints", got=word, hint=hint)
     relation = f"mimics joint {follows.leader!r}" if follows and follows.leader else "is held in place"
     refused = f"{relation} by an equality constraint" if follows else ""
-    if model.jnt_stiffness[j] or model.jnt_stiffnesspoly[j].any() or model.dof_dampingpoly[dof].any():
-        refused = "has a spring or nonlinear damping, which is not modelled"
+    if model.jnt_stiffness[j] or model.jnt_stiffnesspoly[j].any():
+        refused = "has a spring, which is not modelled"
     axis = model.jnt_axis[j].copy()
     start = float(model.qpos0[model.jnt_qposadr[j]])
     limits = model.jnt_range[j] if model.jnt_limited[j] else (-np.inf, np.inf)
@@ -384,6 +411,7 @@ def _joint(model: Any, j: int, name: str, body: str, follows: Coupling | None, l
         damping=float(model.dof_damping[dof]),
         friction=float(model.dof_frictionloss[dof]),
         armature=float(model.dof_armature[dof]),
+        drag=_drag(model.dof_dampingpoly[dof]),
         lower=float(limits[0]),
         upper=float(limits[1]),
         effort_limit=_effort(model, j),

@@ -59,6 +59,11 @@ class RobotModel:
         coupling: matrix C `(nq, nq)` for drives that move with several joints, at the speeds C q̇; `None` if
             each joint has its own drive. Damping, friction and armature are those of the drives.
         torque_scale: torque of each drive over its nominal one, `(nq,)`; `None` if torques are measured.
+        drag: quadratic and cubic damping, `(nq, 2)` [N m s²/rad², N m s³/rad³; N s²/m², N s³/m³]; `None` for
+            linear damping.
+        bristle: stiffness of dry friction with memory (LuGre), 0 without memory, `(nq,)` [N m/rad, N/m];
+            `None` for no memory. It is read from and written to files, while equations of motion have the
+            friction of a joint that keeps sliding, as above.
     """
 
     name: str
@@ -91,6 +96,8 @@ class RobotModel:
     remarks: tuple[str, ...] = ()
     coupling: Tensor | None = None
     torque_scale: Tensor | None = None
+    drag: Tensor | None = None
+    bristle: Tensor | None = None
 
     def __repr__(self) -> str:
         """Return a one-line summary without the values of the tensors."""

@@ -15,6 +15,8 @@ from forcegp.errors import InertiaError, RobotFileError, UnsupportedRobotError, 
 
 JointKind = Literal["revolute", "prismatic", "fixed"]
 Base = Literal["fixed", "free"]
+FRICTION_VELOCITY = 0.1
+"""Default speed scale of dry friction [rad/s, m/s], which robot files do not specify."""
 
 
 @dataclass(frozen=True)
@@ -65,6 +67,8 @@ class Drive:
         name: description of the element in the file, used in messages.
         ratios: speed of the drive per joint speed; empty if it depends on the configuration.
         armature, damping, friction: parameters of the drive. A joint has ratio² times the first two.
+        drag: quadratic and cubic damping of the drive.
+        lugre: of dry friction with memory, σ₀, τ_c, τ_s and ω_s; empty without.
         gains: of an actuator, its gear and, of a servo, its stiffness and damping `kp` and `kv`.
     """
 
@@ -74,6 +78,8 @@ class Drive:
     damping: float = 0.0
     friction: float = 0.0
     gains: Mapping[str, float] = field(default_factory=dict)
+    drag: tuple[float, float] = (0.0, 0.0)
+    lugre: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -81,6 +87,7 @@ class Joint:
     """A joint between two links.
 
     Attributes:
+        drag, stribeck, stribeck_velocity, bristle: see `RobotModel`.
         refused: the reason why the joint must be locked, or an empty string.
         follows: the position that this joint has if it mimics another joint.
         locked: position at which the joint was locked [rad, m].
@@ -95,6 +102,10 @@ class Joint:
     damping: float = 0.0
     friction: float = 0.0
     armature: float = 0.0
+    drag: tuple[float, float] = (0.0, 0.0)
+    stribeck: float = 0.0
+    stribeck_velocity: float = FRICTION_VELOCITY
+    bristle: float = 0.0
     lower: float = -np.inf
     upper: float = np.inf
     velocity_limit: float = np.inf

@@ -12,6 +12,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, NamedTuple
+from xml.sax.saxutils import quoteattr
 
 import numpy as np
 import torch
@@ -27,6 +28,7 @@ from forcegp.robot.model import BASE_JOINTS, RobotModel
 from forcegp.robot.safety import parse_xml, read_bytes
 from forcegp.robot.tree import (
     Base,
+    Drive,
     Inertial,
     Tree,
     checked,
@@ -46,6 +48,13 @@ ORIENTATIONS = ("axisangle", "euler", "xyaxes", "zaxis")
 """Attributes for the orientation of an inertial frame in MJCF, apart from a quaternion."""
 
 
+DRAG = ("quadratic damping", "cubic damping")
+BRISTLE = ("friction", "stribeck", "stribeck_velocity", "bristle")
+"""Parameters of polynomial damping and of dry friction with memory, which MJCF supports."""
+TIMESTEP = 0.002
+"""Time step of MuJoCo unless a file states it [s]."""
+NO_MOTOR = 'input="none" motorconst="1e-9" resistance="1"'
+"""Attributes of a DC motor without control and back-EMF, whose friction alone acts."""
 FORCES = {"motor": ("gear",), "position": ("kp", "kv"), "velocity": ("kv",)}
 """Attributes of actuators in MJCF that are proportional to their force."""
 
@@ -120,8 +129,9 @@ def write_robot(
     changes = [*_joint_changes(writer, tree, robot, file), *_link_changes(writer, tree, robot, file)]
     scaled, unscaled = _scale_changes(writer, robot)
     changes += scaled
+    writer.finish()
     written = document.written()
-    losses = (*_losses(robot, writer.figures), *unscaled, *_base_losses(robot, writer))
+    losses = (*_losses(robot, writer), *unscaled, *_base_losses(robot, writer))
     _check(
         robot, robot_of(checked(lock_joints(read_tree(written, path, base), locked)), _world(robot)), writer
     )
@@ -150,24 +160,47 @@ def _world(robot: RobotModel) -> dict[str, np.ndarray]:
     return {name: getattr(robot, name).numpy() for name in ("base_rotation", "base_position", "gravity")}
 
 
+def _figure(robot: RobotModel, name: str) -> Tensor:
+    """Return a parameter of each joint `(nq,)`, which is zero if the robot does not have it."""
+    if name in DRAG:
+        return 0.0 * robot.damping if robot.drag is None else robot.drag[:, DRAG.index(name)]
+    values = getattr(robot, name)
+    return 0.0 * robot.damping if values is None else values
+
+
 def _joint_changes(writer: _Urdf | _Mjcf, tree: Tree, robot: RobotModel, file: RobotModel) -> list[Change]:
     """Write changed joint parameters, without those of other drives, and return the changes."""
     changes, joints = [], {joint.name: joint for joint in tree.joints}
     for i, joint in enumerate(robot.joint_names):
         if i in writer.of_base:
             continue
-        values = {}
+        names = *writer.figures, *(DRAG if writer.has_laws else ())
+        bristles = writer.has_laws and bool(_figure(robot, "bristle")[i] > 0.0)
+        names = (*names, *BRISTLE[1:]) if bristles else names
+        pairs = {name: [float(_figure(x, name)[i]) for x in (file, robot)] for name in names}
+        found = [Change(joint, name, *pair) for name, pair in pairs.items()]
+        found = [each for each in found if abs(each.after - each.before) > CHANGED * abs(each.before)]
+        own = vars(joints[joint]) | dict(zip(DRAG, joints[joint].drag, strict=True))
+        changed, values = {each.figure for each in found}, dict[str, str]()
+        written = {name: pair[1] - pair[0] + own[name] for name, pair in pairs.items()}
+        bent = bristles and not changed.isdisjoint(BRISTLE)
         for figure, attribute in writer.figures.items():
-            before, after = float(getattr(file, figure)[i]), float(getattr(robot, figure)[i])
-            if abs(after - before) > CHANGED * abs(before):
-                of_drives = before - getattr(joints[joint], figure)
-                if after < of_drives:
+            if figure in changed and not (figure == "friction" and bent):
+                if written[figure] < 0.0:
                     text = f"{writer.label}: the {figure} of joint {joint!r} is below that of its actuators"
-                    raise RobotFileError(text, expected=f"at least {of_drives:g}", got=after)
-                values[attribute] = _text(after - of_drives)
-                changes.append(Change(joint, figure, before, after))
+                    least, after = pairs[figure][0] - own[figure], pairs[figure][1]
+                    raise RobotFileError(text, expected=f"at least {least:g}", got=after)
+                values[attribute] = _text(written[figure])
+        curved = writer.has_laws and any(x for name in DRAG for x in pairs[name])
+        if curved and not changed.isdisjoint(("damping", *DRAG)):
+            # Without all three coefficients, the others are those of a default class.
+            values["damping"] = _text(np.array([written[name] for name in ("damping", *DRAG)]))
+        if bent:
+            values |= {"frictionloss": "0"} if own["friction"] else {}
+            writer.set_bristle(joint, own["friction"] - pairs["friction"][0], *(pairs[x][1] for x in BRISTLE))
         if values:
             writer.set_joint(joint, values)
+        changes += found
     return changes
 
 
@@ -268,11 +301,12 @@ def _body(pose: Tensor, J: Tensor) -> Inertial | None:
     return Inertial(float(mass), com.numpy(), inertia.numpy())
 
 
-def _losses(robot: RobotModel, figures: Mapping[str, str]) -> tuple[str, ...]:
+def _losses(robot: RobotModel, writer: _Urdf | _Mjcf) -> tuple[str, ...]:
     """Describe the parameters that the format cannot represent."""
-    losses = []
-    for figure in ("damping", "friction", "stribeck", "armature"):
-        values = getattr(robot, figure)
+    losses, figures = [], (*writer.figures, *(DRAG if writer.has_laws else ()))
+    rigid = _figure(robot, "bristle") == 0.0 if writer.has_laws else torch.ones_like(robot.damping).bool()
+    for figure in ("damping", *DRAG, "friction", "stribeck", "bristle", "armature"):
+        values = _figure(robot, figure) * (rigid if figure in BRISTLE else 1.0)
         if figure not in figures and bool((values != 0.0).any()):
             listed = ", ".join(f"{x:.4g}" for x in values.tolist())
             losses.append(f"the format does not support {figure} ({listed})")
@@ -289,21 +323,23 @@ def _base_losses(robot: RobotModel, writer: _Urdf | _Mjcf) -> Iterator[str]:
 
 def _check(robot: RobotModel, read: RobotModel, writer: _Urdf | _Mjcf) -> None:
     """Compare a robot with the robot read from the written text; raise `RobotFileError` if they differ."""
-    for figure in (*FLOORS, *writer.figures):
+    for figure in (*FLOORS, *writer.figures, *((*DRAG, *BRISTLE[1:]) if writer.has_laws else ())):
         wrong = _differing(figure, robot, read, 10.0 * SAME)
         wrong = [i for i in wrong if figure in FLOORS or i not in writer.of_base]
+        if figure in BRISTLE[1:3]:
+            wrong = [i for i in wrong if _figure(robot, "bristle")[i] > 0.0]
         if wrong:
             raise RobotFileError(
                 f"{writer.label}: this would change the {figure} of joint {robot.joint_names[wrong[0]]!r}",
-                expected=getattr(robot, figure)[wrong[0]].tolist(),
-                got=getattr(read, figure)[wrong[0]].tolist(),
+                expected=_figure(robot, figure)[wrong[0]].tolist(),
+                got=_figure(read, figure)[wrong[0]].tolist(),
                 hint="<compiler> settings such as boundmass, inertiafromgeom or settotalmass alter values",
             )
 
 
 def _differing(figure: str, one: RobotModel, other: RobotModel, tolerance: float) -> list[int]:
     """Return the joints whose parameters differ by more than a fraction of their size."""
-    wanted, got = (getattr(robot, figure).reshape(robot.nq, -1) for robot in (one, other))
+    wanted, got = (_figure(robot, figure).reshape(robot.nq, -1) for robot in (one, other))
     size = wanted.abs().amax(-1) + FLOORS.get(figure, 0.0)
     return ((wanted - got).abs().amax(-1) > tolerance * size).nonzero()[:, 0].tolist()
 
@@ -316,6 +352,8 @@ class _Urdf:
     """Attributes of a URDF document."""
 
     figures: ClassVar = {"damping": "damping", "friction": "friction"}
+    has_laws: ClassVar = False
+    """Whether the format supports polynomial damping and dry friction with memory."""
     of_base: tuple[int, ...] = ()
 
     def __init__(self, document: EditableXml, label: str) -> None:
@@ -331,9 +369,15 @@ class _Urdf:
         for name, text in values.items():
             self.document.set(dynamics, name, text)
 
+    def set_bristle(self, joint: str, other: float, *law: float) -> None:
+        """URDF has no friction with memory."""
+
     def scale_actuators(self, joint: str, scale: float) -> list[Change]:
         """URDF has no motors."""
         return []
+
+    def finish(self) -> None:
+        """URDF has no motors."""
 
     def set_inertial(self, link: str, body: Inertial) -> None:
         element = self._named["link", link]
@@ -365,6 +409,7 @@ class _Mjcf:
     """Attributes of an MJCF document."""
 
     figures: ClassVar = {"damping": "damping", "friction": "frictionloss", "armature": "armature"}
+    has_laws: ClassVar = True
     of_base: tuple[int, ...] = ()
 
     def __init__(self, document: EditableXml, label: str, content: Tree) -> None:
@@ -381,6 +426,10 @@ class _Mjcf:
         sections = [section for section in document.root.children if section.tag == "actuator"]
         self._actuators = [e for section in sections for e in section.children]
         self._drives = [drive for drive in content.drives if drive.gains]
+        self._keys = [e for e in document.root.iter() if e.tag == "key" and "act" in e.attributes]
+        steps = (e.attributes.get("timestep") for e in document.root.children if e.tag == "option")
+        self._step = next((float(step) for step in steps if step), TIMESTEP)
+        self._motors: list[str] = []
 
     def _element(self, kind: str, name: str, among: Mapping[str, Span]) -> Span:
         if name not in among:
@@ -394,8 +443,44 @@ class _Mjcf:
         for name, text in values.items():
             self.document.set(element, name, text)
 
-    def scale_actuators(self, joint: str, scale: float) -> list[Change]:
-        """Scale the motors and servos of a joint alone."""
+    def set_bristle(self, joint: str, other: float, *law: float) -> None:
+        """Write LuGre friction to the motor of a joint that has it, or add a motor without any other force.
+
+        MuJoCo evaluates the bristles z at the start of a step h. With the damping σ₁ = σ₀ h, the force σ₀ z +
+        σ₁ ż is that at its end, without which joints at rest would vibrate.
+
+        Args:
+            joint: the joint.
+            other: dry friction of the joint alone, minus that of the joint with its drives.
+            law: the parameters `BRISTLE`.
+        """
+        dry, excess, speed, stiffness = law
+        pairs = [each for each in self._pairs(joint) if each[1].lugre and set(each[1].ratios) == {joint}]
+        ratio = abs(pairs[0][1].ratios[joint]) if pairs else 1.0
+        dry += other + ratio * sum(drive.lugre[1] for _, drive in pairs)
+        values = [stiffness / ratio**2, stiffness * self._step / ratio**2, dry / ratio]
+        text = _text(np.array([*values, (dry + excess) / ratio, speed * ratio]))
+        if pairs and pairs[0][0].tag == "dcmotor":
+            self.document.set(pairs[0][0], "lugre", text)
+        elif pairs:
+            hint = "write it as <dcmotor>"
+            got = f"<{pairs[0][0].tag}>"
+            text = f"{self.label}: the actuator of joint {joint!r} with LuGre friction cannot be edited"
+            raise RobotFileError(text, expected="<dcmotor>", got=got, hint=hint)
+        else:
+            self.set_joint(joint, {"name": joint})
+            self._motors.append(f"<dcmotor joint={quoteattr(joint)} {NO_MOTOR} lugre={quoteattr(text)}/>")
+
+    def finish(self) -> None:
+        """Write the motors that were added, after all others, and their states in keyframes."""
+        if self._motors:
+            motors = "".join(f"\n    {motor}" for motor in self._motors)
+            self.document.append(self.document.root, f"<actuator>{motors}\n  </actuator>")
+        for key in self._keys if self._motors else ():
+            self.document.set(key, "act", key.attributes["act"] + len(self._motors) * " 0")
+
+    def _pairs(self, joint: str) -> list[tuple[Span, Drive]]:
+        """Return the actuators of the document with those of the model."""
         if len(self._actuators) != len(self._drives):
             raise RobotFileError(
                 f"{self.label}: actuators of joint {joint!r} may be in an included file",
@@ -403,8 +488,12 @@ class _Mjcf:
                 got=len(self._actuators),
                 hint="write to the included file, or expand the includes first",
             )
+        return list(zip(self._actuators, self._drives, strict=True))
+
+    def scale_actuators(self, joint: str, scale: float) -> list[Change]:
+        """Scale the motors and servos of a joint alone."""
         changes = []
-        for element, drive in zip(self._actuators, self._drives, strict=True):
+        for element, drive in self._pairs(joint):
             names = FORCES.get(element.tag, ())
             # The armature and damping of a motor grow with its gear.
             if set(drive.ratios) == {joint} and not ("gear" in names and (drive.armature or drive.damping)):

@@ -67,6 +67,8 @@ class ContactSolverEngine(MuJoCoWorld):
         options.tolerance = SOLVED
         damping, friction = (_per_joint(robot, solver, name) for name in ("joint_damping", "joint_friction"))
         self.model.dof_damping[self._dof] = robot.damping.numpy() + damping
+        if robot.drag is not None:
+            self.model.dof_dampingpoly[self._dof] = robot.drag.numpy()
         self.model.dof_frictionloss[self._dof] = robot.friction.numpy() + friction
         geom = self.model.geom
         self._pairs = [(geom(f"surface_{i}").id, geom(f"tip_{i}").id) for i in range(len(system.contacts))]
@@ -85,7 +87,10 @@ class ContactSolverEngine(MuJoCoWorld):
         data, dof = self._data, self._dof
         data.qfrc_applied[dof] = torque
         self._mujoco.mj_forward(self.model, data)
-        M, hD = self._mass_matrix(data), self.model.opt.timestep * self.model.dof_damping
+        # D = d + 2 b |q̇| + 3 c q̇²
+        slopes = np.stack([2.0 * np.abs(data.qvel), 3.0 * data.qvel**2], axis=-1)
+        D = self.model.dof_damping + (self.model.dof_dampingpoly * slopes).sum(-1)
+        M, hD = self._mass_matrix(data), self.model.opt.timestep * D
         qdd = np.linalg.solve(M + np.diag(hD), M @ data.qacc)
         contacts = [self._contact_force(*pair) for pair in self._pairs]
         none = np.zeros((0, 2, len(dof))), np.zeros((0, 2, 3))

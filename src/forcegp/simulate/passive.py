@@ -75,15 +75,26 @@ class PassiveForces:
 
         Raises:
             UnknownNameError: a joint of the robot is not in the model.
+        ModelError: a DC motor of the model has LuGre friction.
         """
         mujoco = optional_module("mujoco", "Learned forces in a simulation")
         dof, _ = self._places(model)
-        kept = model.dof_damping[dof], model.dof_frictionloss[dof]
+        motor = model.actuator_dyntype == mujoco.mjtDyn.mjDYN_DCMOTOR
+        if (motor & (model.actuator_dynprm[:, 5] > 0.0)).any():
+            raise ModelError(
+                "a DC motor of the MuJoCo model has LuGre friction, which cannot be switched off",
+                expected="a model without lugre, since the learned forces contain friction",
+                hint="load the original robot file",
+            )
+        names = "dof_damping", "dof_dampingpoly", "dof_frictionloss"
+        kept = {name: getattr(model, name)[dof] for name in names}
         before = mujoco.get_mjcb_passive()
-        model.dof_damping[dof] = model.dof_frictionloss[dof] = 0.0
+        for name in names:
+            getattr(model, name)[dof] = 0.0
         mujoco.set_mjcb_passive(self)
         try:
             yield
         finally:
             mujoco.set_mjcb_passive(before)
-            model.dof_damping[dof], model.dof_frictionloss[dof] = kept
+            for name, values in kept.items():
+                getattr(model, name)[dof] = values

@@ -138,6 +138,7 @@ SHAPES: dict[str, tuple[str | int, ...]] = {
     "base_position": (3,),
     "gravity": (3,),
     "coupling": ("nq", "nq"),
+    "drag": ("nq", 2),
 }
 """Shapes of the robot tensors that do not consist of one number per joint."""
 MAY_BE_INFINITE = ("lower", "upper", "velocity_limit", "effort_limit")

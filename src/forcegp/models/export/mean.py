@@ -159,6 +159,9 @@ class Mean:
             fast = v / v_s if s else v * 0.0
             dry = (-(fast * fast)).exp() * s + c
             direction = (v / v_c).tanh() if slip is None else slip[i]
+            if self.robot.drag is not None:
+                b, cubic = self.robot.drag[i].tolist()
+                d = abs(v) * b + v * v * cubic + d
             force.append(-(v * d) - (dry * direction if c or s else 0.0))
         return np.array(force, dtype=object)
 
