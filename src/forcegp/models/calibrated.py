@@ -1,17 +1,18 @@
 """The robot identified by a fit, with parameters that robot files support, and posterior samples of it.
 
-Robot files support joint friction only in the form d q̇ + f sign q̇. The coefficients d and f are therefore
+URDF supports joint friction only in the form d q̇ + f sign q̇. The coefficients d and f are therefore
 fitted to the learned friction Q_D(q̇) over the trained speeds by least squares, with an offset c:
 
     min Σ_v (Q_D(v) + d v + f sign v − c)²,   d, f ≥ 0.
 
-If friction depends on the load, Q_D is averaged over poses. The residual and the offset c are lost. Logs
-rarely separate an offset from the gravity force of the links. If an offset is within 2σ of zero, all other
-parameters are therefore conditioned on c = 0. URDF does not support armature, so drive inertia is added to
-the links as far as physically possible. Samples are computed in the same way from functions drawn from the
-posterior, with inertial parameters π + S δ (`forces/priors/inertial.py`). If the inertia was identified
-first, there are two estimates, which differ by b. The robot lies halfway between them, and samples are
-spread by N(0, ¼ b bᵀ) in addition: mean and covariance of an estimate that is either one with probability ½.
+MJCF also supports polynomial damping and friction with memory (`friction_law.py`). If friction depends on the
+load, Q_D is averaged over poses. The residual and the offset c are lost. Logs rarely separate an offset from
+the gravity force of the links. If an offset is within 2σ of zero, all other parameters are therefore
+conditioned on c = 0. URDF does not support armature, so drive inertia is added to the links as far as
+physically possible. Samples are computed in the same way from functions drawn from the posterior, with
+inertial parameters π + S δ (`forces/priors/inertial.py`). If the inertia was identified first, there are two
+estimates, which differ by b. The robot lies halfway between them, and samples are spread by N(0, ¼ b bᵀ) in
+addition: mean and covariance of an estimate that is either one with probability ½.
 """
 
 from __future__ import annotations
@@ -34,14 +35,16 @@ from forcegp.forces.posterior import HIGH, LOW, ForceSamples
 from forcegp.forces.priors.constants import DrivePrior
 from forcegp.forces.priors.inertial import InertialPrior, PayloadPrior
 from forcegp.forces.priors.joint import AnalyticalMean
+from forcegp.forces.priors.memory import BristlePrior
 from forcegp.forces.quantities import States, states_at
 from forcegp.forces.term import JointTerm
 from forcegp.identification import regressor
+from forcegp.models.friction_law import RATE, Laws, Reversals, laws_of
 from forcegp.models.parameters import SCALE, is_identified
 from forcegp.models.structured_fit import StructuredFit
 from forcegp.robot.inertia import from_pseudo_inertia, inertial_parameters, pseudo_inertia, pseudo_inertia_of
 from forcegp.robot.model import RobotModel
-from forcegp.robot.write_back import is_mjcf, write_robot
+from forcegp.robot.write_back import BRISTLE, DRAG, is_mjcf, per_joint, write_robot
 
 SPEEDS, POSES = 20, 20
 """Number of speeds in each direction, and number of poses, at which friction is evaluated."""
@@ -59,14 +62,15 @@ SMALLEST = 1e-2
 """Smallest eigenvalue ε of a link's pseudo-inertia relative to the identified pseudo-inertia."""
 ROUNDS, RELAXATION = 300, 1.6
 """Number of iterations and over-relaxation of the search for the closest physical bodies."""
-STATES, RATE = 400, 4.0
-"""Number of random states used to add drive inertia to links; ratio of acceleration to speed [1/s]."""
+STATES = 400
+"""Number of random states used to add drive inertia to links."""
 WANTED = 0.01
 """Target relative torque error ε."""
 MOMENTS = ("mass", "mass·x", "mass·y", "mass·z", "Ixx", "Ixy", "Ixz", "Iyy", "Iyz", "Izz")
 """Inertial parameters of a link about its origin [kg, kg m, kg m²]."""
 FIGURES = ("damping", "friction", *MOMENTS, "armature")
-"""Names of the parameters of a joint."""
+LAW = (*DRAG, *BRISTLE[1:])
+"""Names of the parameters of a joint, and of those of friction that only MJCF supports."""
 
 
 @dataclass(frozen=True)
@@ -97,8 +101,9 @@ class Calibration:
         parameters: the changed parameters with their values in the file and their standard deviations.
         speeds, friction, friction_std: speeds [rad/s, m/s], learned friction of each joint and its standard
             deviation [N m, N], each `(k, nq)`.
-        left: RMS friction that d q̇ + f sign q̇ does not explain, `(nq,)` [N m, N].
+        left: RMS friction that the robot does not have, `(nq,)` [N m, N].
         offset: additional constant force, `(nq,)` [N m, N].
+        levels, levels_std: static and dynamic dry friction at low and at high speed, `(2, nq)` [N m, N].
     """
 
     robot: RobotModel
@@ -108,12 +113,14 @@ class Calibration:
     friction_std: Tensor
     left: Tensor
     offset: Tensor
+    levels: Tensor
+    levels_std: Tensor
 
     @property
     def losses(self) -> tuple[str, ...]:
         """Learned forces that a robot file cannot represent, described by one sentence per joint."""
         left, offset = (x.round(decimals=9).tolist() for x in (self.left, self.offset))  # no rounding errors
-        texts = "friction beyond d q̇ + f sign q̇ of {:.3g} (root mean square)", "a constant force of {:.3g}"
+        texts = "friction beyond that of the file of {:.3g} (root mean square)", "a constant force of {:.3g}"
         sentences = []
         for joint, *sizes in zip(self.robot.joint_names, left, offset, strict=True):
             parts = [text.format(size) for text, size in zip(texts, sizes, strict=True) if size]
@@ -123,7 +130,7 @@ class Calibration:
 
 @torch.no_grad()
 def calibrated(
-    fit: StructuredFit, *, draws: int = DRAWS, seed: int = 0, gain_std: float = 0.0
+    fit: StructuredFit, *, draws: int = DRAWS, seed: int = 0, gain_std: float = 0.0, mjcf: bool = False
 ) -> Calibration:
     """Return the robot with the identified inertia and payload, and with friction that robot files support.
 
@@ -133,6 +140,7 @@ def calibrated(
         seed: random seed for these samples, and for the poses over which friction is averaged.
         gain_std: relative standard deviation of the torque sensors' gains, which no log determines. The
             resulting errors of the identified inertia are included in its standard deviations.
+        mjcf: whether friction has the form of MJCF, with polynomial damping and memory, or else of URDF.
 
     Returns:
         The robot, its parameters with standard deviations, and the losses.
@@ -145,20 +153,24 @@ def calibrated(
         `write_robot(calibrated(fit).robot, "my.urdf", "calibrated.urdf")`
     """
     reader = _Reader.of(fit, seed, gain_std=gain_std)
-    mean, *samples = reader.robots(draws)
+    (mean, *samples), laws = reader.robots(draws, mjcf)
     file = fit.specified.robot
     robot, (curve, left, offset) = mean
     curves = torch.stack([found for _, (found, _, _) in samples])
     # Scales remain those that instruments found, and undetermined ones nominal.
     robot = robot.replace(torque_scale=fit.system.robot.torque_scale)
     robots = [each for each, _ in samples]
-    parameters = (*_parameters(file, robot, robots, reader.scale), *_torque_scales(fit, robot))
-    return Calibration(robot, parameters, reader.speeds, curve, curves.std(0), left, offset)
+    parameters = (*_parameters(file, robot, robots, reader.scale, mjcf), *_torque_scales(fit, robot))
+    dry = torch.from_numpy(laws.values[..., 3:5].sum(-1)), torch.from_numpy(laws.values[..., 3])
+    levels, std = (
+        torch.stack(each).to(curve) for each in zip(*((x[0], x[1:].std(0)) for x in dry), strict=True)
+    )
+    return Calibration(robot, parameters, reader.speeds, curve, curves.std(0), left, offset, levels, std)
 
 
 @torch.no_grad()
 def sampled_robots(
-    fit: StructuredFit, samples: int, *, seed: int = 0, gain_std: float = 0.0
+    fit: StructuredFit, samples: int, *, seed: int = 0, gain_std: float = 0.0, mjcf: bool = False
 ) -> list[RobotModel]:
     """Draw physically consistent robots from the joint posterior of inertia, drives, payload and friction.
 
@@ -169,7 +181,7 @@ def sampled_robots(
         fit: a fit with an analytical mean.
         samples: number of robots.
         seed: random seed.
-        gain_std: see `calibrated`.
+        gain_std, mjcf: see `calibrated`.
 
     Raises:
         ModelError: see `calibrated`.
@@ -178,7 +190,7 @@ def sampled_robots(
     if samples < 1:
         raise ParameterError("invalid number of samples", expected="1 or more", got=samples)
     reader = _Reader.of(fit, seed, gain_std=gain_std)
-    return [robot for robot, _ in reader.robots(max(samples, DRAWS))[1 : 1 + samples]]
+    return [robot for robot, _ in reader.robots(max(samples, DRAWS), mjcf)[0][1 : 1 + samples]]
 
 
 def write_calibrated(
@@ -215,10 +227,11 @@ def write_calibrated(
     check_kept(results, [Path(source)])
     for path in results:
         check_destination(path)
-    found = calibrated(fit, seed=seed, gain_std=gain_std)
-    drawn = sampled_robots(fit, samples, seed=seed, gain_std=gain_std) if samples else []
+    mjcf = is_mjcf(source)
+    found = calibrated(fit, seed=seed, gain_std=gain_std, mjcf=mjcf)
+    drawn = sampled_robots(fit, samples, seed=seed, gain_std=gain_std, mjcf=mjcf) if samples else []
     robots = [found.robot, *drawn]
-    drives = not is_mjcf(source) and bool((found.robot.armature != 0.0).any())
+    drives = not mjcf and bool((found.robot.armature != 0.0).any())
     losses: tuple[str, ...] = ()
     for robot, path in zip(robots, paths, strict=True):
         holding = without_armature(robot, found.speeds[-1]) if drives else robot
@@ -232,6 +245,13 @@ def write_calibrated(
     report = {
         "parameters": [vars(parameter) for parameter in found.parameters],
         "losses": [*losses, *found.losses],
+        "dry_friction": {
+            joint: {
+                name: {"value": float(found.levels[k, j]), "std": float(found.levels_std[k, j])}
+                for k, name in enumerate(("static", "dynamic"))
+            }
+            for j, joint in enumerate(found.robot.joint_names)
+        },
         "friction": {
             joint: {
                 "speed": found.speeds[:, j].tolist(),
@@ -337,14 +357,19 @@ class _Reader:
                 fastest = torch.maximum(-values[LOW][0], values[HIGH][0]).clamp(min=1e-6)
         up = torch.linspace(SLOWEST, 1.0, SPEEDS, dtype=robot.dtype, device=robot.device)
         speeds = torch.cat([-up.flip(0), up])[:, None] * fastest
+        return cls(fit, speeds, cls._at(fit, speeds, seed), seed, gain_std)
+
+    @staticmethod
+    def _at(fit: StructuredFit, speeds: Tensor, seed: int) -> States:
+        """Return the states of all poses at the given speeds."""
+        robot = fit.system.robot
         low, high = (x.clamp(-np.pi, np.pi) for x in (robot.lower, robot.upper))
         generator = torch.Generator().manual_seed(seed)
         share = torch.rand(POSES, 1, robot.nq, generator=generator, dtype=robot.dtype)
         q = (low + share.to(robot.device) * (high - low)).expand(-1, len(speeds), -1).flatten(0, 1)
         qd = speeds.expand(POSES, -1, -1).flatten(0, 1)
         open_ = torch.zeros(len(q), len(fit.system.contacts), dtype=torch.bool, device=robot.device)
-        at, _ = states_at(fit.system, q, qd, torch.zeros_like(q), open_)
-        return cls(fit, speeds, at, seed, gain_std)
+        return states_at(fit.system, q, qd, torch.zeros_like(q), open_)[0]
 
     @property
     def scale(self) -> Tensor | None:
@@ -357,8 +382,9 @@ class _Reader:
                 return torch.cat([links, drives[:, None]], dim=-1)
         return None
 
-    def robots(self, draws: int) -> list[tuple[RobotModel, Curve]]:
-        """Return the robots for the posterior mean and for function samples, each with its friction curve."""
+    def robots(self, draws: int, mjcf: bool) -> tuple[list[tuple[RobotModel, Curve]], Laws]:
+        """Return the robots for the posterior mean and for function samples, each with its friction curve,
+        and the friction laws of their joints."""
         generator = torch.Generator().manual_seed(self.seed)
         drawn = self.fit.force_samples(max(draws, DRAWN), generator)
         assert isinstance(drawn, ForceSamples)
@@ -366,8 +392,11 @@ class _Reader:
         inertia = self._constants(drawn, InertialPrior)
         inertia[1:] += self._gain_errors(drawn.count, generator)
         parts = [curves.flatten(1), inertia, *(self._constants(drawn, x) for x in (PayloadPrior, DrivePrior))]
-        sizes, values = [part.shape[-1] for part in parts], torch.cat(parts, dim=-1)
-        offset, kept, b = self._offsets(curves), self._offsets(self._kept()[None]), self._disagreement()
+        reversals = Reversals.of(self.speeds[-1])
+        forces, apart = self._reversing(drawn, reversals)
+        parts, b = [*parts, *(force.flatten(1) for force in forces)], [self._disagreement(), *apart]
+        sizes, values, b = [part.shape[-1] for part in parts], torch.cat(parts, dim=-1), torch.cat(b, dim=-1)
+        offset, kept = self._offsets(curves), self._offsets(self._kept()[None])
         gain = _offset_gain(offset, offset[0] - kept[0], values)
         apart = self._offsets(b[:, : sizes[0]].unflatten(1, self.speeds.shape))
         free, b = values - offset @ gain, b - apart @ gain
@@ -375,8 +404,55 @@ class _Reader:
         # Mean and samples are those of the identified inertia, and the other estimate is b less.
         along = torch.cat([random.new_zeros(1, 1), random]).to(b)
         spread = free[: 1 + draws] + 0.5 * (along - 1.0) * b
-        rows = (row.split(sizes) for row in self._consistent(spread, sizes[0], free[1:]))
-        return [self._robot(curve.view_as(self.speeds), *others) for curve, *others in rows]
+        curves, *others = self._consistent(spread, sizes[0], free[1:]).split(sizes, dim=-1)
+        rows = zip(curves.unflatten(1, self.speeds.shape), *others[:3], strict=True)
+        found = [self._robot(*row) for row in rows]
+        # Friction resists, −Q.
+        resisting = [-part.unflatten(1, (-1, self.speeds.shape[-1])) for part in others[3:]]
+        laws = laws_of(reversals, *resisting)
+        if mjcf:
+            written = laws if laws.has_memory.all() else laws_of(reversals, *resisting, static=False)
+            found = self._with_laws(found, written)
+        return found, laws
+
+    def _reversing(self, drawn: ForceSamples, at: Reversals) -> tuple[list[Tensor], list[Tensor]]:
+        """Return the arguments of `laws_of` as forces Q, and for each the difference of the identified
+        inertia, `(1, k nq)`.
+        """
+        fit, speeds = self.fit, at.both
+        sliding = replace(self, speeds=speeds, at=self._at(fit, speeds, self.seed))
+        forces, apart = [sliding._curves(drawn)], [sliding._kept().flatten()[None]]
+        for p in [p for p, prior in enumerate(fit.force_priors) if isinstance(prior, BristlePrior)]:
+            qd, history = (x.chunk(2)[1] for x in (at.qd, at.history()))
+            closed = torch.zeros(len(qd), len(fit.system.contacts), dtype=torch.bool, device=qd.device)
+            states, _ = states_at(fit.system, 0.0 * qd, qd, 0.0 * qd, closed)
+            features = fit.posterior.process.features(p, fit.system, replace(states, history=history))
+            mean = fit.posterior.latent.latent_mean(p, features)
+            forces.append(torch.cat([mean[None], drawn.functions.latent(p, features)]))
+            apart.append(-self._from_mean(p, features).flatten()[None])
+        return forces, apart
+
+    def _with_laws(self, found: list[tuple[RobotModel, Curve]], laws: Laws) -> list[tuple[RobotModel, Curve]]:
+        """Return the robots with laws of friction, of joints with memory or with polynomial damping."""
+        values = torch.from_numpy(laws.values).to(self.speeds)
+        bristle, drag = values[..., 6], values[..., 1:3]
+        has_law = (bristle[0] > 0.0) | (drag[0] != 0.0).any(-1)
+        if not bool(has_law.any()):
+            return found
+        robots = []
+        for (robot, (curve, left, offset)), law in zip(found, values, strict=True):
+            d, _, _, f, s, speed, stiffness = law.unbind(-1)
+            robot = robot.replace(
+                damping=torch.where(has_law, d, robot.damping),
+                drag=law[:, 1:3] * has_law[:, None],
+                friction=torch.where(has_law, f, robot.friction),
+                stribeck=s * has_law,
+                stribeck_velocity=torch.where(s * has_law > 0.0, speed, robot.stribeck_velocity),
+                bristle=torch.where(stiffness > 0.0, stiffness, per_joint(robot, "bristle")),
+            )
+            left = torch.where(has_law, torch.from_numpy(laws.left).to(left), left)
+            robots.append((robot, (curve, left, offset)))
+        return robots
 
     def _disagreement(self) -> Tensor:
         """Return b `(1, d)`, the identified inertia minus its posterior mean.
@@ -514,7 +590,7 @@ class _Reader:
             known = torch.ones_like(scale) if robot.torque_scale is None else robot.torque_scale
             robot = robot.replace(torque_scale=known * (1.0 + drives.std * scale))
         damping, friction, left, offset = _projected(self.speeds, curve)
-        robot = robot.replace(damping=damping, friction=friction, stribeck=0.0 * friction)
+        robot = robot.replace(damping=damping, friction=friction, stribeck=0.0 * friction, drag=None)
         if self.scale is not None:
             links, drives = delta.split([robot.nq * len(MOMENTS), delta.numel() - robot.nq * len(MOMENTS)])
             robot = _moved(robot, links.view(robot.nq, -1) * self.scale[:, :-1])
@@ -586,11 +662,13 @@ def without_armature(robot: RobotModel, fastest: Tensor) -> RobotModel:
     return errors.updated(held, mean, precision)[0]
 
 
-def _figures(robot: RobotModel) -> Tensor:
-    """Return the parameters of each joint that a fit can change, `(nq, 13)`, in the order of `FIGURES`."""
+def _figures(robot: RobotModel, mjcf: bool) -> Tensor:
+    """Return the parameters of each joint that a fit can change, `(nq, k)`, in the order of `FIGURES` and, in
+    MJCF, `LAW`."""
     friction = torch.stack([robot.damping, robot.friction], dim=-1)
     links = inertial_parameters(robot.mass, robot.com, robot.inertia)
-    return torch.cat([friction, links, robot.armature[:, None]], dim=-1)
+    law = [per_joint(robot, name)[:, None] for name in LAW] if mjcf else []
+    return torch.cat([friction, links, robot.armature[:, None], *law], dim=-1)
 
 
 def _torque_scales(fit: StructuredFit, robot: RobotModel) -> Iterator[Parameter]:
@@ -604,14 +682,15 @@ def _torque_scales(fit: StructuredFit, robot: RobotModel) -> Iterator[Parameter]
 
 
 def _parameters(
-    file: RobotModel, robot: RobotModel, samples: list[RobotModel], scale: Tensor | None
+    file: RobotModel, robot: RobotModel, samples: list[RobotModel], scale: Tensor | None, mjcf: bool
 ) -> tuple[Parameter, ...]:
     """Return all parameters that a fit can change, with their standard deviations over the samples."""
-    before, after = _figures(file), _figures(robot)
-    std, prior = torch.stack([_figures(each) for each in samples]).std(0), after.abs()
+    before, after = _figures(file, mjcf), _figures(robot, mjcf)
+    std, prior = torch.stack([_figures(each, mjcf) for each in samples]).std(0), after.abs()
     if scale is not None:
-        prior[:, 2:] = scale
+        prior[:, 2 : 2 + scale.shape[-1]] = scale
     determined = (std > 0.0) & (std <= DETERMINED * prior)
     columns = [x.T.flatten().tolist() for x in (before, after, std, determined)]
-    named = ((joint, name) for name in FIGURES for joint in robot.joint_names)
-    return tuple(Parameter(*names, *row) for names, *row in zip(named, *columns, strict=True))
+    names = (*FIGURES, *(LAW if mjcf else ()))
+    named = ((joint, name) for name in names for joint in robot.joint_names)
+    return tuple(Parameter(*each, *row) for each, *row in zip(named, *columns, strict=True))

@@ -145,6 +145,7 @@ def _joint(element: Element, label: str) -> Joint:
         axis=_unit(axis.get("xyz", np.array([1.0, 0.0, 0.0])), where),
         damping=damping,
         friction=friction,
+        drag=(0.0, 0.0),
         **_limits(limit, kind, where),
         refused=f"mimics joint {mimic['joint']!r}" if mimic else "",
         follows=_coupling(mimic) if mimic else None,

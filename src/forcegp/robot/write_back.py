@@ -160,7 +160,7 @@ def _world(robot: RobotModel) -> dict[str, np.ndarray]:
     return {name: getattr(robot, name).numpy() for name in ("base_rotation", "base_position", "gravity")}
 
 
-def _figure(robot: RobotModel, name: str) -> Tensor:
+def per_joint(robot: RobotModel, name: str) -> Tensor:
     """Return a parameter of each joint `(nq,)`, which is zero if the robot does not have it."""
     if name in DRAG:
         return 0.0 * robot.damping if robot.drag is None else robot.drag[:, DRAG.index(name)]
@@ -175,9 +175,9 @@ def _joint_changes(writer: _Urdf | _Mjcf, tree: Tree, robot: RobotModel, file: R
         if i in writer.of_base:
             continue
         names = *writer.figures, *(DRAG if writer.has_laws else ())
-        bristles = writer.has_laws and bool(_figure(robot, "bristle")[i] > 0.0)
+        bristles = writer.has_laws and bool(per_joint(robot, "bristle")[i] > 0.0)
         names = (*names, *BRISTLE[1:]) if bristles else names
-        pairs = {name: [float(_figure(x, name)[i]) for x in (file, robot)] for name in names}
+        pairs = {name: [float(per_joint(x, name)[i]) for x in (file, robot)] for name in names}
         found = [Change(joint, name, *pair) for name, pair in pairs.items()]
         found = [each for each in found if abs(each.after - each.before) > CHANGED * abs(each.before)]
         own = vars(joints[joint]) | dict(zip(DRAG, joints[joint].drag, strict=True))
@@ -304,9 +304,9 @@ def _body(pose: Tensor, J: Tensor) -> Inertial | None:
 def _losses(robot: RobotModel, writer: _Urdf | _Mjcf) -> tuple[str, ...]:
     """Describe the parameters that the format cannot represent."""
     losses, figures = [], (*writer.figures, *(DRAG if writer.has_laws else ()))
-    rigid = _figure(robot, "bristle") == 0.0 if writer.has_laws else torch.ones_like(robot.damping).bool()
+    rigid = per_joint(robot, "bristle") == 0.0 if writer.has_laws else torch.ones_like(robot.damping).bool()
     for figure in ("damping", *DRAG, "friction", "stribeck", "bristle", "armature"):
-        values = _figure(robot, figure) * (rigid if figure in BRISTLE else 1.0)
+        values = per_joint(robot, figure) * (rigid if figure in BRISTLE else 1.0)
         if figure not in figures and bool((values != 0.0).any()):
             listed = ", ".join(f"{x:.4g}" for x in values.tolist())
             losses.append(f"the format does not support {figure} ({listed})")
@@ -327,19 +327,19 @@ def _check(robot: RobotModel, read: RobotModel, writer: _Urdf | _Mjcf) -> None:
         wrong = _differing(figure, robot, read, 10.0 * SAME)
         wrong = [i for i in wrong if figure in FLOORS or i not in writer.of_base]
         if figure in BRISTLE[1:3]:
-            wrong = [i for i in wrong if _figure(robot, "bristle")[i] > 0.0]
+            wrong = [i for i in wrong if per_joint(robot, "bristle")[i] > 0.0]
         if wrong:
             raise RobotFileError(
                 f"{writer.label}: this would change the {figure} of joint {robot.joint_names[wrong[0]]!r}",
-                expected=_figure(robot, figure)[wrong[0]].tolist(),
-                got=_figure(read, figure)[wrong[0]].tolist(),
+                expected=per_joint(robot, figure)[wrong[0]].tolist(),
+                got=per_joint(read, figure)[wrong[0]].tolist(),
                 hint="<compiler> settings such as boundmass, inertiafromgeom or settotalmass alter values",
             )
 
 
 def _differing(figure: str, one: RobotModel, other: RobotModel, tolerance: float) -> list[int]:
     """Return the joints whose parameters differ by more than a fraction of their size."""
-    wanted, got = (_figure(robot, figure).reshape(robot.nq, -1) for robot in (one, other))
+    wanted, got = (per_joint(robot, figure).reshape(robot.nq, -1) for robot in (one, other))
     size = wanted.abs().amax(-1) + FLOORS.get(figure, 0.0)
     return ((wanted - got).abs().amax(-1) > tolerance * size).nonzero()[:, 0].tolist()
 
