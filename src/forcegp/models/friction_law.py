@@ -3,9 +3,9 @@
     F = (d + b |q̇| + c q̇²) q̇ + σ₀ z,   dz/dt = q̇ − σ₀ |q̇| z / g(q̇),   g(q̇) = f + s e^{−(q̇/v_s)²}
 
 is fitted to the learned friction by least squares, at the speeds of harmonic motions of different amplitudes
-before and after each reversal. Without memory, σ₀ z = g(q̇) sign q̇. Of (b, c) and s, those are zero without
-which F is within two standard deviations of the learned friction. Damping never drives a joint, since
-d + b v + c v² is a sum of 1, v, v² and (v − v_k)² with weights of at least zero.
+before and after each reversal. Without memory, σ₀ z = g(q̇) sign q̇. Of the laws with and without (b, c) and s,
+the closest is taken in which these are more than two standard deviations from zero. Damping never drives a
+joint, since d + b v + c v² is a sum of 1, v, v² and (v − v_k)² with weights of at least zero.
 Source: Canudas de Wit et al., *A new model for control of systems with friction* (1995).
 """
 
@@ -18,7 +18,7 @@ from itertools import product
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.optimize import lsq_linear
+from scipy.optimize import least_squares, nnls
 from torch import Tensor
 
 from forcegp.forces.priors.memory import DISTANCES
@@ -36,11 +36,11 @@ SLOWEST = 2.0 * SHARPEST
 PHASES = 200
 """Steps in which a bristle is followed from one reversal to the next."""
 OPEN = 2.0
-"""Number of standard deviations within which friction is that of a simpler law."""
-ROUNDS, SHRINK = 4, 0.35
-"""Grids in the search for δ, s/f and v_s, and the width of each over that of the one before."""
+"""Number of standard deviations from zero of memory, and of (b, c) and s, that count as determined."""
+GRID, WIDER = 7, 1.0
+"""Number of starting values of δ, s/f and v_s, and how far the search may leave their range [log]."""
 EXCESS = (0.05, 3.0)
-"""Range of s/f in the first grid."""
+"""Range of s/f at the start of the search."""
 
 
 @dataclass(frozen=True)
@@ -153,46 +153,35 @@ class _Joint:
         return np.stack([*columns, -np.ones_like(v)], axis=1)
 
     def best(self, y: Array, powers: Array, bends: bool, peaked: bool) -> tuple[float, float, float]:
-        """Return the δ, s/f and v_s of the closest law, for any d, b, c, f and offset."""
+        """Return the δ, s/f and v_s of the closest law for any d, b, c, f and offset, found from a grid."""
         Q, _ = np.linalg.qr(powers)
         rest = y - Q @ (Q.T @ y)
-        fastest = np.abs(self.v).max()
-        ranges = {
-            "delta": (DISTANCES[0] / 3.0, 3.0 * DISTANCES[-1], 9 if bends else 0),
-            "excess": (*EXCESS, 5 if peaked else 0),
-            "speed": (0.5 * SLOWEST, max(SLOWEST, 0.5 * fastest), 5 if peaked else 0),
-        }
-        centre = {name: 0.5 * math.log(low * high) for name, (low, high, _) in ranges.items()}
-        half = {name: 0.5 * math.log(high / low) for name, (low, high, _) in ranges.items()}
-        found = 0.0, 0.0, 1.0
-        for _ in range(ROUNDS):
-            axes = [
-                centre[name] + half[name] * np.linspace(-1.0, 1.0, count) if count else np.array([-np.inf])
-                for name, (_, _, count) in ranges.items()
-            ]
-            grid = np.exp(np.array(list(product(*axes)))).T
-            delta, excess, speed = grid[0], grid[1], np.where(grid[2] > 0.0, grid[2], 1.0)
-            columns = self.direction(delta, excess, speed)
-            columns = columns - (columns @ Q) @ Q.T
-            gain = np.maximum(columns @ rest, 0.0) ** 2 / (columns**2).sum(-1)
-            i = int(gain.argmax())
-            found = float(delta[i]), float(excess[i]), float(speed[i])
-            for name, value in zip(ranges, found, strict=True):
-                if ranges[name][2]:
-                    centre[name], half[name] = math.log(value), SHRINK * half[name]
-        return found
+        fast = max(SLOWEST, 0.5 * np.abs(self.v).max())
+        ranges = np.log([(DISTANCES[0] / 3.0, 3.0 * DISTANCES[-1]), EXCESS, (0.5 * SLOWEST, fast)])
+        free = np.array([bends, peaked, peaked])
+        if not free.any():
+            return 0.0, 0.0, 1.0
 
-    def law(self, y: Array, bends: bool, curved: bool, peaked: bool) -> tuple[Array, float, float]:
-        """Return the closest law, and how far the mean and the samples are from such laws (RMS).
+        def left(x: Array) -> Array:
+            """Return what the laws with logarithms x `(g, k)` leave of the friction, `(g, n)`."""
+            shape = np.tile([0.0, 0.0, 1.0], (len(x), 1))
+            shape[:, free] = np.exp(x)
+            bend = self.direction(*shape.T)
+            bend = bend - (bend @ Q) @ Q.T
+            return rest - np.maximum(bend @ rest, 0.0)[:, None] / (bend**2).sum(-1, keepdims=True) * bend
 
-        Args:
-            y: friction of the posterior mean and of samples, `(1 + samples, n)`.
-        """
+        grid = np.array(list(product(*(np.linspace(*each, GRID) for each in ranges[free]))))
+        start = grid[(left(grid) ** 2).sum(-1).argmin()]
+        bounds = tuple((ranges[free] + [-WIDER, WIDER]).T)
+        found = np.array([0.0, 0.0, 1.0])
+        found[free] = np.exp(least_squares(lambda x: left(x[None])[0], start, bounds=bounds).x)
+        return tuple(found.tolist())
+
+    def law(self, y: Array, bends: bool, curved: bool, peaked: bool) -> tuple[Array, float]:
+        """Return the closest law to friction y `(n,)`, and the RMS of what it does not explain."""
         powers = self.powers(curved)
-        shape = self.best(y[0], powers, bends, peaked)
+        shape = self.best(y, powers, bends, peaked)
         bend = self.direction(*(np.array([x]) for x in shape))[0]
-        A = np.column_stack([powers, bend])
-        rest = y - (y @ np.linalg.pinv(A).T) @ A.T
         # d + b v + c v² ≥ 0
         size, cone = np.abs(self.v), [(1.0, 0.0, 0.0)]
         if curved:
@@ -200,14 +189,12 @@ class _Joint:
             cone += [(p * p, -2.0 * p, 1.0) for p in size.max() * np.linspace(0.0, 2.0, 2 * COUNT)]
         rays = np.array(cone)
         columns = (rays @ np.stack([np.ones_like(size), size, size**2]) * self.v).T
-        columns = np.column_stack([columns, bend, -np.ones_like(self.v)])
-        least = np.array([*np.zeros(len(rays) + 1), -np.inf])
-        weights = lsq_linear(columns, y[0], bounds=(least, np.inf)).x
-        dry, (delta, excess, speed) = weights[-2], shape
+        # The states are those of both directions, so an offset is the mean of the friction.
+        weights, _ = nnls(np.column_stack([columns, bend]), y - y.mean())
+        dry, (delta, excess, speed) = weights[-1], shape
         stiffness = dry / delta if delta else 0.0
-        law = np.array([*(weights[:-2] @ rays), dry, excess * dry, speed, stiffness])
-        left = y[0] - columns @ weights
-        return law, float(np.sqrt(np.mean(left**2))), _rms(rest[0]) / max(_rms(rest[1:] - rest[0]), 1e-300)
+        law = np.array([*(weights[:-1] @ rays), dry, excess * dry, speed, stiffness])
+        return law, _rms(y - y.mean() - np.column_stack([columns, bend]) @ weights)
 
     def sampled(self, law: Array, y: Array, bends: bool, curved: bool, peaked: bool) -> Array:
         """Return the laws of the samples `(samples, 7)`, to first order in their distance from the mean."""
@@ -225,8 +212,8 @@ class _Joint:
             size = np.abs(self.v)
             return (d + b * size + c * size**2) * self.v + f * bend
 
-        start = law[free].copy()
-        start[[free.index(i) for i in logarithms]] = np.log(law[logarithms])
+        start, law_logs = law[free].copy(), np.log(law[logarithms])
+        start[[free.index(i) for i in logarithms]] = law_logs
         step = 1e-4 * np.maximum(np.abs(start), 1e-3)
         slopes = [(force(start + e) - force(start - e)) / (2.0 * e.sum()) for e in np.diag(step)]
         J = np.column_stack([*slopes, -np.ones_like(self.v)])
@@ -234,7 +221,7 @@ class _Joint:
         change = ((y[1:] - y[0]) @ np.linalg.pinv(J / scale, rcond=1e-6).T / scale)[:, :-1]
         values = np.tile(law, (len(change), 1))
         values[:, free] = start + change
-        values[:, logarithms] = np.exp(values[:, logarithms])
+        values[:, logarithms] = np.exp(values[:, logarithms].clip(law_logs - WIDER, law_logs + WIDER))
         values[:, [0, 2, 3, 4]] = values[:, [0, 2, 3, 4]].clip(min=0.0)
         values[:, 1] = np.maximum(values[:, 1], -2.0 * np.sqrt(values[:, 0] * values[:, 2]))
         return values
@@ -242,6 +229,16 @@ class _Joint:
 
 def _rms(x: Array) -> float:
     return float(np.sqrt(np.mean(x**2)))
+
+
+def _distance(x: Array, samples: Array) -> float:
+    """Return √(xᵀ C⁻¹ x / k) for the covariance C of samples `(n, k)`, without numbers that are fixed."""
+    std = samples.std(0)
+    x, samples, std = x[std > 0.0], samples[:, std > 0.0], std[std > 0.0]
+    if not len(x):
+        return 0.0
+    inverse = np.linalg.pinv(np.atleast_2d(np.cov(samples.T / std[:, None])), hermitian=True)
+    return float(np.sqrt(x / std @ inverse @ (x / std) / len(x)))
 
 
 def laws_of(at: Reversals, sliding: Tensor, memory: Tensor | None = None, *, static: bool = True) -> Laws:
@@ -266,16 +263,15 @@ def laws_of(at: Reversals, sliding: Tensor, memory: Tensor | None = None, *, sta
             past = np.concatenate([-past, past], axis=1)
             bends = _rms(past[0]) > OPEN * _rms(past[1:] - past[0])
             y = y + past if bends else y
-        kinds = [kind for kind in product((False, True), repeat=2) if static or bends or not kind[1]]
-        found = {}
-        for kind in kinds:
-            found[kind] = joint.law(y, bends, *kind)
-            if found[kind][2] <= OPEN:
-                break
-        kind = next(
-            (k for k, each in found.items() if each[2] <= OPEN), min(found, key=lambda k: found[k][1])
-        )
-        law, rest, _ = found[kind]
-        laws.append(np.concatenate([law[None], joint.sampled(law, y, bends, *kind)]))
+        found = []
+        for curved, peaked in product((False, True), repeat=2):
+            if static or bends or not peaked:
+                law, rest = joint.law(y[0], bends, curved, peaked)
+                samples = joint.sampled(law, y, bends, curved, peaked)
+                extra = [*((1, 2) if curved else ()), *((4,) if peaked else ())]
+                if _distance(law[extra], samples[:, extra]) > OPEN or not extra:
+                    found.append((rest, np.concatenate([law[None], samples])))
+        rest, values = min(found, key=lambda each: each[0])
+        laws.append(values)
         left.append(rest)
     return Laws(np.stack(laws, axis=1), np.array(left))
