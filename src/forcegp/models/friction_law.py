@@ -107,7 +107,7 @@ class Laws:
     left: Array
 
     @property
-    def has_memory(self) -> Array:
+    def has_memory(self) -> NDArray[np.bool_]:
         """Whether each joint has memory, `(nq,)`."""
         return self.values[0, :, 6] > 0.0
 
@@ -170,7 +170,7 @@ class _Joint:
             bend = bend - (bend @ Q) @ Q.T
             return rest - np.maximum(bend @ rest, 0.0)[:, None] / (bend**2).sum(-1, keepdims=True) * bend
 
-        grid = np.array(list(product(*(np.linspace(*each, GRID) for each in ranges[free]))))
+        grid = np.array(list(product(*(np.linspace(low, high, GRID) for low, high in ranges[free]))))
         start = grid[(left(grid) ** 2).sum(-1).argmin()]
         bounds = tuple((ranges[free] + [-WIDER, WIDER]).T)
         found = np.array([0.0, 0.0, 1.0])
