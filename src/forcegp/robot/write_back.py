@@ -3,7 +3,8 @@
 Only changed attributes are edited (`edit_xml.py`). Meshes, comments, order and formatting are preserved. A
 link of the robot may consist of several links in the file that are fixed to each other. Of those that stay
 physically consistent, the heaviest takes the whole change J − J₀ in pseudo-inertia. If none stays consistent,
-each J_k changes to E J_k Eᵀ, where E satisfies E J₀ Eᵀ = J. The edited text is checked before it is written.
+each J_k changes to E J_k Eᵀ, where E satisfies E J₀ Eᵀ = J. In MJCF, dry friction with memory is that of a DC
+motor without control. The edited text is checked before it is written.
 """
 
 from __future__ import annotations
@@ -85,7 +86,8 @@ def write_robot(
 ) -> WrittenRobot:
     """Write the masses, inertias, damping, friction and armature of a robot into a copy of its file.
 
-    If torques have a scale, the motors and servos of an MJCF file are scaled by it.
+    If torques have a scale, the motors and servos of an MJCF file are scaled by it. MJCF also takes
+    polynomial damping (`drag`), and friction with memory of the joints that have a `bristle`.
 
     Args:
         robot: the robot with the parameters to write. It must have the links and joints of the file.
