@@ -218,6 +218,7 @@ class _Joint:
         slopes = [(force(start + e) - force(start - e)) / (2.0 * e.sum()) for e in np.diag(step)]
         J = np.column_stack([*slopes, -np.ones_like(self.v)])
         scale = np.sqrt((J**2).sum(0))
+        scale[scale == 0.0] = 1.0  # v_s below all speeds has no effect
         change = ((y[1:] - y[0]) @ np.linalg.pinv(J / scale, rcond=1e-6).T / scale)[:, :-1]
         values = np.tile(law, (len(change), 1))
         values[:, free] = start + change
