@@ -260,6 +260,7 @@ def _reduce_constraints(spec: Any, path: Path) -> list[dict[str, float]]:
         gain = actuator.gainprm[0] if of_force else 0.0
         actuator.set_to_motor()
         actuator.gainprm[0], actuator.inheritrange, actuator.actdim = gain, 0.0, -1
+        actuator.ctrlspec = 0  # MuJoCo before 4.0 keeps that of a passive motor
         actuator.actlimited = mujoco.mjtLimited.mjLIMITED_FALSE
     return gains
 
