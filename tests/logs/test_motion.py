@@ -234,3 +234,36 @@ def test_seconds_and_nanoseconds_are_one_clock(tmp_path: Path) -> None:
     assert any("added up sec and nanosec" in step for step in result.report.steps)
     with pytest.raises(MappingError, match=r"time.unit: the columns of the clock need one unit each"):
         parse_mapping(toml.replace('["s", "ns"]', '"s"').encode(), "m.toml")
+
+
+def swapped(n: int = 900, dt: float = 0.01, shift: float = 0.0) -> Motion:
+    """A motion of which the last link is the base in the second third; jumps differ from that by `shift`."""
+    t = np.arange(n) * dt
+    x = t[:, None] * np.array([1.1, 1.7])
+    q, qd = 0.6 * np.sin(x) + [0.2, 1.2], 0.6 * np.array([1.1, 1.7]) * np.cos(x)
+    other = (t >= 3.0) & (t < 6.0)
+    # θ_1 of the other base is the absolute angle of link 2, up to half a turn.
+    q[other, 0] += q[other, 1] - np.pi + shift
+    return Motion(t, q, qd, np.cos(x))
+
+
+def test_a_log_with_two_bases_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(
+        DataError, match=r"the base of the robot changes in rows 300, 600: .*'shoulder'"
+    ) as it:
+        imported(tmp_path, swapped(), velocity=False)
+    assert it.value.hint is not None and "[time]" in it.value.hint
+    with_gap, m = swapped(), swapped()
+    keep = ~((m.t > 2.9) & (m.t < 3.0))
+    with_gap = Motion(m.t[keep], m.q[keep], m.qd[keep], m.tau[keep])
+    with pytest.raises(DataError, match="the base of the robot changes"):
+        imported(tmp_path, with_gap, velocity=False)
+
+
+def test_other_jumps_are_not_those_of_a_base(tmp_path: Path) -> None:
+    result = imported(tmp_path, swapped(shift=0.3), velocity=False)
+    assert "lost" in kinds(result)
+    m = swapped()
+    same = (m.t < 3.0) | (m.t >= 6.0)
+    parts = [Motion(m.t[rows], m.q[rows], m.qd[rows], m.tau[rows]) for rows in (same & (m.t < 3.0), ~same)]
+    assert all(len(imported(tmp_path, part, velocity=False).data) for part in parts)

@@ -26,7 +26,7 @@ from forcegp.logs.from_contact import derive_joints, stick_speeds
 from forcegp.logs.gather import gather
 from forcegp.logs.mapping import Mapping, default_mapping, load_mapping, parse_mapping, scale_std
 from forcegp.logs.modelled import find_modelled, without_noise
-from forcegp.logs.motion import check_clock, find_jumps
+from forcegp.logs.motion import check_base, check_clock, find_jumps
 from forcegp.logs.servo import damp, servo_fields, spring_torque
 from forcegp.logs.smoothing import add_derivatives, impact_mask
 from forcegp.logs.table import Array, ImportFinding, ImportReport, Signals
@@ -119,6 +119,7 @@ def import_log(
             signals = gather(path, log_mapping, system.robot, report, progress)
             announce_memory(8 * NUMBERS * system.robot.nq * len(signals), f"importing {len(signals):,} rows")
             check_clock(signals, system.robot.revolute.numpy() > 0.0, report)
+            check_base(signals, system.robot)
             find_jumps(signals, report)
             derived = tuple(name for name in ("qd", "qdd") if signals.lacking(name).any())
             even_clock(signals, log_mapping.sections.time.period, report)

@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d, median_filter, uniform_filter1d
 
 from forcegp.data.derivative import UNIFORM_TOLERANCE
 from forcegp.errors import DataError
+from forcegp.kinematics import link_poses
 from forcegp.logs import units
 from forcegp.logs.clock import GAP_STEPS, usual_step
 from forcegp.logs.table import Array, ImportReport, Signals
+from forcegp.robot import RobotModel
 from forcegp.robust import robust_std
+from forcegp.rows import describe, numbered
 
 TURNS = {unit: 2.0 * np.pi / units.QUANTITY["position"][unit] for unit in ("rad", "mrad", "deg", "rev")}
 """One turn in each unit of angles."""
@@ -30,6 +34,11 @@ NEIGHBOURS, CLEAR = 11, 8.0
 """Rows in a running median; least usual step in units of the noise."""
 LOST_STEP, LOST_SHARE, MANY_STEPS = 0.5, 0.002, 3.0
 """Additional steps that mean a lost row, if they occur in this share of the rows; and in a single row."""
+LONGEST_PAUSE = 1.0
+"""Longest gap in a log over which a jump of an angle is that of a base, and not of another motion [s]."""
+BASE_JUMP, SAME_ANGLE = 0.1, 0.01
+"""Least jump of the first joint, and largest difference from the angle between the links [rad]. On a real
+robot with two hooks, eight jumps of 1.1 rad differ by at most 0.003 rad."""
 MOST_HELD = 0.05
 """Share of held rows above which the logger is faster than its source, so that jumps are expected."""
 
@@ -96,6 +105,51 @@ def check_clock(signals: Signals, revolute: NDArray[np.bool_], report: ImportRep
             text = f"the unit of time or of the position is wrong: joints turn at {speed:.3g} rad/s"
             expected = f"at most {MOST_SPEED:g} rad/s"
             raise DataError(text, expected=expected, got=f"a usual step of {step:.3g} s", hint=hint)
+
+
+def check_base(signals: Signals, robot: RobotModel) -> None:
+    """Raise `DataError` if the base changes along the log, as of a robot that swings hand over hand.
+
+    If the last link n becomes the base, the first joint counts from it and all other joints go on. With the
+    rotation D = R_1ᵀ R_n between the links, relative to that at q = 0, the first link jumps from R_1 to R_1 D
+    or R_1 Dᵀ, up to half a turn.
+    """
+    q, t = signals.vectors["q"], signals.t
+    slopes = np.diff(q, axis=0) / np.where(np.diff(t) > 0.0, np.diff(t), np.inf)[:, None]
+    before, after = np.roll(slopes, 1, axis=0), np.roll(slopes, -1, axis=0)
+    beyond = np.abs(np.diff(q, axis=0)) - np.maximum(np.abs(before), np.abs(after)) * np.diff(t)[:, None]
+    goes_on = (np.diff(t) > 0.0) & (np.diff(t) < LONGEST_PAUSE)
+    jumps = goes_on & (beyond[:, 0] > BASE_JUMP) & (np.abs(np.diff(q[:, 1:], axis=0)) < BASE_JUMP).all(axis=1)
+    rows = np.flatnonzero(jumps)
+    if robot.nq < 2 or not len(rows):
+        return
+    R = link_poses(robot, torch.from_numpy(np.concatenate([0.0 * q[:1], q[rows], q[rows + 1]]))).R
+    R = R.permute(3, 2, 0, 1).numpy()
+    R = R[1:] @ R[0].swapaxes(-1, -2)
+    old, new = R[: len(rows)], R[len(rows) :, 0]
+    first = old[:, 0].swapaxes(-1, -2)
+    changes = np.zeros(len(rows), dtype=bool)
+    for leaf in set(range(1, robot.nq)) - set(robot.parents):
+        D = first @ old[:, leaf]
+        for turn in (D, D.swapaxes(-1, -2)):
+            found = _half_turns(first @ new @ turn.swapaxes(-1, -2)) < SAME_ANGLE
+            changes |= found & (_half_turns(D) > BASE_JUMP)
+    if changes.any():
+        places = describe(numbered(signals.row[rows[changes] + 1]))
+        raise DataError(
+            f"the base of the robot changes in {places}: the angle of {robot.joint_names[0]!r} jumps by that "
+            "between the first and the last link, while all other joints go on",
+            expected="one base in the whole log",
+            got=f"jumps of up to {np.abs(np.diff(q[:, 0]))[rows[changes]].max():.3g} rad",
+            hint="import the parts between these rows separately, with start and stop under [time], and each "
+            "with the robot file of its base",
+        )
+
+
+def _half_turns(R: Array) -> Array:
+    """Return the angle (n,) [rad] between rotations (n, 3, 3) and the nearest multiple of half a turn."""
+    angle = np.arccos(np.clip(0.5 * (np.trace(R, axis1=-2, axis2=-1) - 1.0), -1.0, 1.0))
+    return np.minimum(angle, np.pi - angle)
 
 
 def _velocity_ratio(signals: Signals, rows: NDArray[np.int64], lag: int, moved: Array) -> float | None:
