@@ -37,7 +37,7 @@ PAIRS = [
 WORDS = {
     *("model", "engine", "contact", "address", "quantity", "frame", "reference", "stabilization", "method"),
     *("to", "name", "start", "velocity", "acceleration", "torque", "box", "criterion", "tip_radius"),
-    *("axes", "point"),
+    *("axes", "point", "recording"),
 }
 """Options that accept text and no path."""
 NUMBER = "3"

@@ -228,7 +228,7 @@ def read_log(path: str | Path) -> Log:
     for name in absent:
         raw |= {f"{name}.{joint}": np.full_like(raw["t"], np.nan, dtype=float) for joint in joints}
     fields = parse(str(path), raw, header, None)
-    del fields["extras"], fields["contact_extras"]
+    del fields["extras"], fields["contact_extras"], fields["recording"]
     return derive(Log(**fields), absent)
 
 

@@ -45,6 +45,9 @@ def import_(
             "'fit' to estimate it; default: the radius in the scene."
         ),
     ] = None,
+    recording: Annotated[
+        str | None, Option(help="Name of the recording; default: that of the log without its ending.")
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Import a log from a CSV, text, Parquet, NumPy, MATLAB, HDF5, ROS bag, MCAP or LeRobot file.
@@ -74,7 +77,8 @@ def import_(
         return
     with progress_bar(f"reading {log.name}", 1) as advance:
         imported = import_log(log, system, mapping, advance, displaced=fit_surface is not None)
-    save(imported.data.write, place)
+    data = imported.data if recording is None else imported.data.named(recording)
+    save(data.write, place)
     result = _json(imported) if as_json else _summary(imported)
     if fit_surface is not None:
         result |= _surfaces(imported, system, fit_surface, _tip_radius(tip_radius))

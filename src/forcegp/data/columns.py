@@ -12,17 +12,27 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from forcegp.data.derivative import SavitzkyGolay, differentiate
-from forcegp.data.fields import AXES, JOINT_VECTORS, DataHeader, Fields, component_names, named_columns
+from forcegp.data.fields import (
+    AXES,
+    JOINT_VECTORS,
+    UNKNOWN,
+    DataHeader,
+    Fields,
+    component_names,
+    named_columns,
+)
 from forcegp.data.table import Columns, IgnoredColumnsWarning
 from forcegp.errors import DataError, near_names
 from forcegp.limits import JOINTS, SEGMENT_NUMBER
 
 Arrays = dict[str, Any]
+WHAT = {"segment": "trajectory", "recording": "recording"}
 
 
 def unparse(data: Fields) -> tuple[Columns, DataHeader]:
     """Return the columns and header of a data set in file format."""
     columns: dict[str, Tensor] = {"t": data.t, "segment": data.segment}
+    columns |= {"recording": data.recording} if bool((data.recording != UNKNOWN).any()) else {}
     columns |= {f"contact.{name}": value for name, value in data.contact.items()}
     for name, value in named_columns(data).items():
         parts = component_names(name, value, data.joint_names)
@@ -47,7 +57,9 @@ def parse(source: str, raw: Columns, header: DataHeader, method: SavitzkyGolay |
         if not (method and name in absent):
             fields[name] = _joint_vector(source, unread, name, joints)
     fields["contact"] = {name: _contact(source, unread, f"contact.{name}") for name in contacts}
-    fields["segment"] = _segment(source, unread, len(fields["t"]))
+    n = len(fields["t"])
+    fields["segment"] = _numbers(source, unread, "segment", 0, n)
+    fields["recording"] = _numbers(source, unread, "recording", UNKNOWN, n)
     fields["extras"], fields["contact_extras"] = _extras(source, unread, joints, contacts)
     if unread:
         text = f"{source}: columns of unknown meaning are ignored: {', '.join(unread)}"
@@ -104,12 +116,12 @@ def _contact(source: str, unread: Columns, name: str) -> NDArray[np.bool_]:
     return values.astype(bool)
 
 
-def _segment(source: str, unread: Columns, n: int) -> NDArray[np.int64]:
-    values = unread.pop("segment", np.zeros(n, np.int64))
+def _numbers(source: str, unread: Columns, name: str, default: int, n: int) -> NDArray[np.int64]:
+    values = unread.pop(name, np.full(n, default, np.int64))
     numbers = np.asarray(values, float)
     wrong = np.flatnonzero(~(np.abs(numbers) <= SEGMENT_NUMBER) | (numbers != np.floor(numbers)))
     if len(wrong):
-        text = f"{source}: column 'segment' is not a trajectory number in row {wrong[0]}"
+        text = f"{source}: column {name!r} is not a {WHAT[name]} number in row {wrong[0]}"
         raise DataError(text, expected=f"an integer between ±{SEGMENT_NUMBER}", got=values[wrong[0]])
     return values.astype(np.int64)
 

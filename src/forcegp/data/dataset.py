@@ -53,6 +53,8 @@ class Dataset(Fields):
         extras: additional joint vectors `(n, nq)`, keyed by name: `qdd_clean`, `Q`, `Q_z`, `Q_I`, …
         contact_extras: contact quantities `(n,)`, `(n, 3)`, keyed by name and contact: `multiplier`, `F_I`, …
         segment: trajectory number of each row, `(n,)`. By default, there is a single trajectory.
+        recording: number of the recording to which each row belongs, `(n,)`, or −1 if it is unknown. Names
+            are those in `header.recordings`; a recording without a name is named by its number.
         header: noise, sampling period, robot, seed and provenance.
 
     Extras are also available as attributes, as in `data.Q_z` and `data.multiplier["table"]`.
@@ -74,9 +76,10 @@ class Dataset(Fields):
     def __post_init__(self) -> None:
         object.__setattr__(self, "joint_names", tuple(self.joint_names))
         fields.check_tensors(self)
-        if self.segment is None:
-            zero = torch.zeros(self.t.shape, dtype=torch.int64, device=self.t.device)
-            object.__setattr__(self, "segment", zero)
+        for name, value in (("segment", 0), ("recording", fields.UNKNOWN)):
+            if getattr(self, name) is None:
+                default = torch.full(self.t.shape, value, dtype=torch.int64, device=self.t.device)
+                object.__setattr__(self, name, default)
         fields.check_layout(self)
         fields.check_values(self)
 
@@ -148,6 +151,29 @@ class Dataset(Fields):
     def contact_names(self) -> tuple[str, ...]:
         """Names of the contacts, in column order."""
         return tuple(self.contact)
+
+    @property
+    def recordings(self) -> tuple[str, ...]:
+        """Names of the recordings, without unknown ones, in the order of their first rows."""
+        names = {fields.recording_number(name): name for name in self.header.recordings}
+        numbers = dict.fromkeys(self.recording.unique_consecutive().tolist())
+        return tuple(names.get(k, str(k)) for k in numbers if k != fields.UNKNOWN)
+
+    def named(self, recording: str) -> Dataset:
+        """Return the same data as one recording with the given name.
+
+        Recordings of a robot share its friction and links, and each has its own offset of the torques.
+
+        Raises:
+            DataError: the name is empty.
+        """
+        if not recording:
+            raise DataError("a recording needs a name", expected="one or more characters", got="none")
+        logs = {*self.header.recordings.values()}
+        known = {recording: logs.pop() if len(logs) == 1 else ""}
+        header = self.header.model_copy(update={"recordings": known})
+        number = torch.full_like(self.segment, fields.recording_number(recording))
+        return self.replace(recording=number, header=header)
 
     def active(self, contacts: Sequence[str]) -> Tensor:
         """Return whether each of the named contacts is closed, as a mask `(n, len(contacts))`.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -41,6 +42,7 @@ class DataHeader(Header):
             but follow from commands or currents with nominal constants.
         servo_stiffness, servo_damping: nominal k_p and k_d of each servo [N m/rad, N m s/rad], if torques
             follow from the commanded positions `extras["command"]`.
+        recordings: hash of the log of each recording, keyed by name; empty if the log is unknown.
         joint_names, contact_names: names in column order, empty if not logged.
     """
 
@@ -63,6 +65,7 @@ class DataHeader(Header):
     torque_scale_std: PositiveFloat | None = None
     servo_stiffness: tuple[PositiveFloat, ...] = ()
     servo_damping: tuple[NonNegativeFloat, ...] = ()
+    recordings: dict[str, str] = Field(default_factory=dict)
     joint_names: tuple[str, ...] = ()
     contact_names: tuple[str, ...] = ()
 
@@ -82,8 +85,25 @@ class DataHeader(Header):
 
 JOINT_VECTORS = ("q", "qd", "tau", "qdd")
 """Joint vectors contained in every data set."""
+NUMBERS = ("segment", "recording")
+"""Integer columns of a data set."""
 AXES = ("x", "y", "z")
 """Components of a Cartesian vector logged for a contact."""
+
+
+UNKNOWN = -1
+"""Number of an unknown recording."""
+
+
+def recording_number(name: str) -> int:
+    """Return the number of a recording, which is its name or the 53-bit hash of its name.
+
+    >>> recording_number("12"), recording_number("run") == recording_number("run")
+    (12, True)
+    """
+    if name.isdecimal() and len(name) < 16 and str(int(name)) == name:
+        return int(name)
+    return int.from_bytes(hashlib.sha256(name.encode()).digest()[:8], "big") >> 11
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,6 +120,7 @@ class Fields:
     extras: Mapping[str, Tensor] = field(default_factory=dict)
     contact_extras: Mapping[str, Mapping[str, Tensor]] = field(default_factory=dict)
     segment: Tensor = None  # pyright: ignore[reportAssignmentType]  # filled in by the data set
+    recording: Tensor = None  # pyright: ignore[reportAssignmentType]  # filled in by the data set
     header: DataHeader = field(default_factory=DataHeader)
 
     def __len__(self) -> int:
@@ -126,7 +147,7 @@ def mapped(parts: Sequence[Fields], change: Callable[[list[Tensor]], Tensor]) ->
     """Combine data sets with equal layouts by applying `change` to the tensors of each column."""
     first = parts[0]
     return {
-        **{name: change([getattr(p, name) for p in parts]) for name in ("t", "segment", *JOINT_VECTORS)},
+        **{name: change([getattr(p, name) for p in parts]) for name in ("t", *NUMBERS, *JOINT_VECTORS)},
         "contact": {name: change([p.contact[name] for p in parts]) for name in first.contact},
         "extras": {name: change([p.extras[name] for p in parts]) for name in first.extras},
         "contact_extras": {
@@ -144,7 +165,7 @@ def check_tensors(data: Fields) -> None:
         _check_kind(name, group, Mapping, "a mapping of contacts to tensors")
     named = {"t": data.t, **named_columns(data)}
     named |= {f"contact.{name}": value for name, value in data.contact.items()}
-    named |= {} if data.segment is None else {"segment": data.segment}
+    named |= {name: getattr(data, name) for name in NUMBERS if getattr(data, name) is not None}
     for name, value in named.items():
         _check_kind(name, value, Tensor, "a tensor", f"call torch.tensor({name}, dtype=torch.float64)")
 
@@ -175,7 +196,8 @@ def check_layout(data: Fields) -> None:
         _check_type(name, value, data.t)
     for name in (*JOINT_VECTORS, *data.extras):
         _check_shape(name, getattr(data, name), (n, nq), f"{n} samples of {nq} joints")
-    for name, value in (("segment", data.segment), *data.contact.items()):
+    numbers = {name: getattr(data, name) for name in NUMBERS}
+    for name, value in (*numbers.items(), *data.contact.items()):
         _check_shape(name, value, (n,), f"{n} samples")
     for name, group in data.contact_extras.items():
         for contact, value in group.items():
@@ -189,8 +211,9 @@ def check_layout(data: Fields) -> None:
     for name, value in data.contact.items():
         if value.dtype != torch.bool:
             raise DataError(f"column 'contact.{name}' has the wrong type", expected="bool", got=value.dtype)
-    if data.segment.dtype != torch.int64:
-        raise DataError("column 'segment' has the wrong type", expected="int64", got=data.segment.dtype)
+    for name, value in numbers.items():
+        if value.dtype != torch.int64:
+            raise DataError(f"column {name!r} has the wrong type", expected="int64", got=value.dtype)
 
 
 def _check_names(data: Fields) -> None:
@@ -410,7 +433,25 @@ def common_header(headers: Sequence[DataHeader]) -> DataHeader:
         )
     agreed["torque_scale_std"] = max((std for std in stated if std is not None), default=None)
     agreed["stick_speeds"] = common_stick_speeds(headers)
+    agreed["recordings"] = common_recordings(headers)
     agreed["ordered"] = all(header.ordered for header in headers)
     agreed["filtered"] = any(header.filtered for header in headers)
     agreed["filter_span"] = max((h.filter_span for h in headers if h.filter_span is not None), default=None)
     return DataHeader(**agreed)
+
+
+def common_recordings(headers: Sequence[DataHeader]) -> dict[str, str]:
+    """Return the recordings of all headers; raise `DataError` if two logs have the same name."""
+    found: dict[str, str] = {}
+    for name, log in (pair for header in headers for pair in header.recordings.items()):
+        if log and found.get(name):
+            if log != found[name]:
+                raise DataError(
+                    f"two recordings are named {name!r}",
+                    expected="a distinct name for each log, since a recording has its own offset",
+                    got=", ".join(found),
+                    hint="rename one: data.named('another name'), or `forcegp import --recording`",
+                )
+        else:
+            found[name] = log or found.get(name, "")
+    return found

@@ -11,11 +11,13 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import DataHeader, Dataset
 from forcegp.data.clipped import clipped
+from forcegp.data.fields import recording_number
 from forcegp.errors import DataError
 from forcegp.guards import foreign
 from forcegp.logs.base import add_imu
@@ -223,6 +225,7 @@ def _dataset(
     if "command" in signals.vectors:
         extras["command"] = _tensor(signals.vectors.pop("command"))
     servo = mapping.sections.servo
+    names, recording = _recordings(signals, report)
     vectors = {name: _tensor(signals.vectors.pop(name)) for name in ("q", "qd", "qdd", "tau")}
     of_contacts = {key: {name: _tensor(x) for name, x in of.items()} for key, of in of_contacts.items()}
     header = DataHeader(
@@ -239,6 +242,7 @@ def _dataset(
         stick_speeds=sticking,
         torque_scale_std=scale_std(mapping),
         **({} if servo is None else servo_fields(mapping, robot.joint_names)),
+        recordings=names,
         joint_names=robot.joint_names,
         contact_names=tuple(signals.contact),
     )
@@ -250,8 +254,19 @@ def _dataset(
         extras=extras,
         contact_extras=of_contacts,
         segment=torch.from_numpy(signals.segment),
+        recording=torch.from_numpy(recording),
         header=header,
     )
+
+
+def _recordings(signals: Signals, report: ImportReport) -> tuple[dict[str, str], NDArray[np.int64]]:
+    """Return the recordings, named by the log and their numbers in it, and that of each row (n,)."""
+    stem = Path(report.source).stem
+    if "recording" not in signals.vectors:
+        return {stem: report.log}, np.full(len(signals), recording_number(stem))
+    numbers, places = np.unique(signals.vectors.pop("recording"), return_inverse=True)
+    names = [f"{stem} {number:.0f}" for number in numbers]
+    return dict.fromkeys(names, report.log), np.array([*map(recording_number, names)])[places.reshape(-1)]
 
 
 def _tensor(values: Array) -> torch.Tensor:

@@ -9,12 +9,14 @@ and torques τ_p, and q = C⁻¹ p, τ = Cᵀ τ_p.
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import torch
 
+from forcegp import limits
 from forcegp.errors import DataError
 from forcegp.logs import units
 from forcegp.logs.base import FOOT, ORIENTATION, check_base, columns_of_base, orientations, place_base
@@ -41,7 +43,7 @@ def gather(
 ) -> Signals:
     """Read the mapped columns of a log onto a common clock, with at most `rows` rows if possible."""
     sections, joints = mapping.sections, robot.joint_names
-    needed = {*sections.time.columns, sections.time.segment or sections.time.columns[0]}
+    needed = {*sections.time.columns, sections.time.segment, sections.time.recording} - {None}
     for name in LOGGED:
         if mapping.quantity(name) is not None:
             needed |= set(mapping.columns_of(name, joints))
@@ -107,6 +109,8 @@ class _Gathering:
         if self.mapping.sections.wrench is not None:
             vectors["wrench"] = self._wrench()
         vectors |= {**self._flags(), **self._base()}
+        if self.time.recording is not None:
+            vectors["recording"] = self.reference, self._recording(self.time.recording)
         signals = self._reference({n: x for n, (stream, x) in vectors.items() if stream is self.reference})
         for name, (stream, values) in vectors.items():
             if stream is not self.reference:
@@ -234,6 +238,15 @@ class _Gathering:
             vectors[name] = stream, orientations(values, section, self.report) if turn else values
         return vectors
 
+    def _recording(self, column: str) -> Array:
+        """Return the number of the recording of each row (n, 1)."""
+        values = self._take(self.reference, column)
+        wrong = np.flatnonzero((values != np.floor(values)) | (np.abs(values) > limits.SEGMENT_NUMBER))
+        if len(wrong):
+            text = f"{self.table.source}: column {column!r} does not number recordings in row {wrong[0]}"
+            raise DataError(text, expected="an integer in every row", got=values[wrong[0]])
+        return values[:, None]
+
     def _stamps(self, stream: Stream) -> Array:
         """Return the time stamps of a stream [s]."""
         columns, holder = self.time.columns, stream
@@ -256,10 +269,12 @@ class _Gathering:
         """Return the complete, cropped rows of the stream with the positions, and their trajectories."""
         t = self._stamps(self.reference)
         self.report.rows_read = len(t)
+        self.report.log = hashlib.sha256(t.tobytes() + vectors["q"].tobytes()).hexdigest()[:16]
         segment = np.zeros(len(t), dtype=np.int64)
-        if self.time.segment is not None:
-            numbers = self._take(self.reference, self.time.segment)
-            segment[1:] = np.cumsum(numbers[1:] != numbers[:-1])
+        for column in (self.time.segment, self.time.recording):
+            if column is not None:
+                numbers = self._take(self.reference, column)
+                segment[1:] += np.cumsum(numbers[1:] != numbers[:-1])
         signals = Signals(self.joints, t, np.arange(len(t)), segment, vectors)
         self._complete(signals)
         drop_repeated(signals, self.report)

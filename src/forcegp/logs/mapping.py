@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from forcegp.constraints import ConstrainedSystem
-from forcegp.data.fields import lock_hint
+from forcegp.data.fields import NUMBERS, lock_hint
 from forcegp.errors import MappingError, did_you_mean
 from forcegp.guards import is_file
 from forcegp.logs import units
@@ -170,6 +170,7 @@ class TimeSection(Section):
     start: float = -np.inf
     stop: float = np.inf
     segment: str | None = None
+    recording: str | None = None
     period: float | None = Field(default=None, gt=0.0)
     gap: float | None = Field(default=None, gt=0.0)
     missing: Literal["error", "drop"] = "error"
@@ -571,7 +572,7 @@ def default_mapping(path: str | Path, system: ConstrainedSystem) -> Mapping:
         # On a topic of joint states, messages of other nodes lack joints or efforts.
         more = {"missing": "drop"} if time == "header" else {}
         draft = Draft(
-            str(path), {"column": time, "segment": "segment" if "segment" in names else None, **more}
+            str(path), {"column": time, **{name: name for name in NUMBERS if name in names}, **more}
         )
         for name, word in logged.items():
             draft.families[name] = Family(f"{word}.{{joint}}", {}, unit=units.SI[name])

@@ -203,11 +203,14 @@ class ImportFinding:
 
 @dataclass
 class ImportReport:
-    """Findings and actions of an import. `rows_read` is the length of the stream that defines the clock."""
+    """Findings and actions of an import. `rows_read` is the length of the stream that defines the clock, and
+    `log` is a hash of its times and positions.
+    """
 
     source: str
     format: str = ""
     rows_read: int = 0
+    log: str = ""
     findings: list[ImportFinding] = field(default_factory=list)
     steps: list[str] = field(default_factory=list)
 
