@@ -25,6 +25,7 @@ from .forces.measurements import Observation as Observation
 from .forces.noise import Noise as Noise
 from .forces.priors.base import OperatorForcePrior as OperatorForcePrior
 from .forces.priors.constants import DrivePrior as DrivePrior
+from .forces.priors.constants import OffsetPrior as OffsetPrior
 from .forces.priors.constants import PerRecording as PerRecording
 from .forces.priors.contact import ContactForcePrior as ContactForcePrior
 from .forces.priors.contact import NormalForcePrior as NormalForcePrior

@@ -10,10 +10,11 @@ import torch
 
 import forcegp
 from forcegp import dynamics
+from forcegp.data.fields import UNKNOWN
 from forcegp.errors import ModelError
 from forcegp.forces.posterior import ForceSamples
 from forcegp.forces.priors.base import ForcePrior
-from forcegp.forces.priors.constants import DrivePrior, PerRecording
+from forcegp.forces.priors.constants import DrivePrior, OffsetPrior, PerRecording
 from forcegp.forces.priors.inertial import PayloadPrior
 from forcegp.forces.priors.joint import JointForcePrior, JointFrictionPrior
 from forcegp.forces.quantities import states
@@ -66,17 +67,35 @@ def _constants(fit: StructuredFit) -> tuple[torch.Tensor, torch.Tensor]:
 
 def test_two_recordings_have_their_own_payloads_in_one_fit(tmp_path: Path) -> None:
     robot = forcegp.load_robot("double_pendulum")
-    parts = [_recording(_loaded(robot, mass), 1.0, k) for k, mass in enumerate(MASSES)]
+    parts = [_recording(_loaded(robot, mass), 1.0, k).named(str(k)) for k, mass in enumerate(MASSES)]
     data = forcegp.Dataset.concatenate(parts)
-    fit = _fit(data, PerRecording(PayloadPrior(measured=True), (0, 1)))
+    fit = _fit(data, PerRecording(PayloadPrior(measured=True), ("0", "1")))
     mean, std = _constants(fit)
-    found, error = mean.view(2, 4)[:, 0], std.view(2, 4)[:, 0]
-    assert bool(((found - torch.tensor(MASSES)).abs() <= SIGMAS * error).all())
-    assert float(error.max()) < 0.2
+    scale = fit.hyperparameters["payload.log_scale"].exp()
+    found, error = mean.view(4, 3)[0], std.view(4, 3)[0]
+    assert bool(((found[:2] - torch.tensor(MASSES)).abs() <= SIGMAS * error[:2]).all())
+    assert float(error[:2].max()) < 0.2
+    # The payload of another recording is unknown.
+    assert float(found[2]) == 0.0 and float(error[2] / scale) == pytest.approx(1.0, abs=0.15)
     fit.save(tmp_path / "model")
     again = forcegp.load_model(tmp_path / "model")
-    state = parts[1].q[:5], parts[1].qd[:5], parts[1].tau[:5]
-    torch.testing.assert_close(again.predict(*state).mean, fit.predict(*state).mean)
+    assert isinstance(again, StructuredFit)
+    torch.testing.assert_close(again.predict_log(parts[1]).mean, fit.predict_log(parts[1]).mean)
+
+
+def test_predictions_along_a_log_contain_the_payload_of_its_recording() -> None:
+    """Loads change the acceleration exactly, not only to first order, and other recordings have bars."""
+    robot = forcegp.load_robot("double_pendulum")
+    heavy = [_recording(_loaded(robot, mass), 1.0, k).named(str(k)) for k, mass in enumerate(MASSES)]
+    fit = _fit(forcegp.Dataset.concatenate(heavy), PerRecording(PayloadPrior(measured=True), ("0", "1")))
+    test = _recording(_loaded(robot, MASSES[1]), 1.0, 7)
+    known, other = fit.predict_log(test.named("1"), noise=True), fit.predict_log(test, noise=True)
+    errors = [float((found.mean - test.qdd).square().mean().sqrt()) for found in (known, other)]
+    assert errors[0] < 0.1 * errors[1]
+    assert known.std is not None and other.std is not None
+    assert float(((other.mean - test.qdd).abs() <= 2.0 * other.std).double().mean()) > 0.9
+    assert float(known.std.mean()) < 0.1 * float(other.std.mean())
+    torch.testing.assert_close(other.mean, fit.predict(test.q, test.qd, test.tau).mean)
 
 
 def test_drive_constants_are_learned_with_their_errors() -> None:
@@ -91,24 +110,118 @@ def test_drive_constants_are_learned_with_their_errors() -> None:
 
 def test_rows_of_a_recording_have_its_columns_only() -> None:
     system = forcegp.ConstrainedSystem(forcegp.load_robot("double_pendulum"))
-    q = torch.randn(3, 2, dtype=torch.float64)
-    time = torch.tensor([[0.0, 0.0], [0.0, 2.0], [0.0, 5.0]], dtype=torch.float64)
-    at = states(system, q, q, q, torch.zeros(3, 0, dtype=torch.bool), time=time)
-    E = PerRecording(PayloadPrior(), (0, 2, 3)).operator(system, at).unflatten(-1, (3, 4))
-    own = PayloadPrior().operator(system, at)
-    for row in range(3):
-        torch.testing.assert_close(E[row, :, row], own[row])
+    q, numbers = torch.randn(3, 2, dtype=torch.float64), torch.tensor([[5], [2], [UNKNOWN]])
+    at = states(system, q, q, q, torch.zeros(3, 0, dtype=torch.bool), recording=numbers)
+    prior, own = PerRecording(PayloadPrior(), ("2", "5")), PayloadPrior().operator(system, at)
+    E = prior.operator(system, at).unflatten(-1, (4, 3))
+    for row, place in enumerate((1, 0, 2)):
+        torch.testing.assert_close(E[row, ..., place], own[row])
     assert float(E.abs().sum()) == pytest.approx(float(own.abs().sum()))
-    new = PerRecording(PayloadPrior(), (0, 2)).operator(system, replace(at, time=None)).unflatten(-1, (2, 4))
-    torch.testing.assert_close(new[:, :, 1], own)
-    assert not bool(new[:, :, 0].any())
+    new = prior.operator(system, replace(at, recording=None)).unflatten(-1, (4, 3))
+    torch.testing.assert_close(new[..., 2], own)
+    assert not bool(new[..., :2].any())
 
 
-def test_what_is_not_constant_or_ordered_is_refused() -> None:
+OFFSETS = ((0.8, 0.0), (-0.5, 0.0), (0.4, 0.0))
+"""Offsets of the torque sensors in three recordings [N m]; joint 2 has none."""
+
+
+def _offset(seed: int, offset: tuple[float, float], name: str) -> forcegp.Dataset:
+    """A recording of an arm with friction along a smooth motion, with an offset of the logged torques."""
+    robot, generator = forcegp.load_robot("double_pendulum"), torch.Generator().manual_seed(seed)
+    t = 0.01 * torch.arange(800, dtype=torch.float64)
+    size, w, phase = torch.rand(3, 4, 2, generator=generator, dtype=torch.float64)
+    w, angle = 1.0 + 4.0 * w, t[:, None, None] * (1.0 + 4.0 * w) + 6.0 * phase
+    q, qd, qdd = (
+        (x * (0.3 + 0.3 * size)).sum(1) for x in (angle.sin(), w * angle.cos(), -w * w * angle.sin())
+    )
+    friction = 0.3 * qd + 0.5 * torch.tanh(qd / 0.02)
+    tau = dynamics.inverse_dynamics(robot, q, qd, qdd) - dynamics.damping_force(robot, qd) + friction
+    tau = tau + torch.tensor(offset) + 0.05 * torch.randn(tau.shape, generator=generator, dtype=tau.dtype)
+    return forcegp.Dataset(t, q, qd, tau, qdd, robot.joint_names).named(name)
+
+
+@pytest.fixture(scope="module")
+def of_recordings() -> StructuredFit:
+    """A default fit of three recordings."""
+    parts = [_offset(k, each, f"run {k}") for k, each in enumerate(OFFSETS)]
+    system = forcegp.ConstrainedSystem(forcegp.load_robot("double_pendulum"))
+    return forcegp.StructuredGP(system).fit(forcegp.Dataset.concatenate(parts))
+
+
+def test_a_default_fit_learns_the_offset_of_each_recording(of_recordings: StructuredFit) -> None:
+    worth = of_recordings.result.worth
+    assert worth["recordings of shoulder"] > 100.0 and worth["recordings of elbow"] == 0.0
+    learned = {each.name: each for each in of_recordings.parameters()}
+    each = [learned[f"recordings.offset_run {k} of shoulder"] for k in range(3)]
+    # A common offset is part of friction. τ = M q̈ − Q + offset, so offsets of the force have the other sign.
+    for other, offset in ((1, OFFSETS[1]), (2, OFFSETS[2])):
+        difference = each[other].value - each[0].value
+        assert difference == pytest.approx(-(offset[0] - OFFSETS[0][0]), abs=0.03)
+    unknown = learned["recordings.offset of shoulder"]
+    assert unknown.value == 0.0 and 0.3 < unknown.std < 1.5 and not unknown.determined
+    assert learned["recordings.offset of elbow"].std < 1e-4
+
+
+def test_a_log_uses_the_offset_of_its_recording_only_if_it_names_it(
+    of_recordings: StructuredFit, tmp_path: Path
+) -> None:
+    fit, test = of_recordings, _offset(9, OFFSETS[1], "run 1")
+    named = fit.predict_log(test, "joint_force", noise=True)
+    for other in (
+        test.named("another run"),
+        test.replace(recording=torch.full_like(test.recording, UNKNOWN)),
+    ):
+        unknown = fit.predict_log(other, "joint_force", noise=True)
+        assert named.std is not None and unknown.std is not None
+        assert float(unknown.std[:, 0].median()) > 5.0 * float(named.std[:, 0].median())
+        missed = (fit.predict_log(other).mean - test.qdd).square().mean(0)
+        known = (fit.predict_log(test).mean - test.qdd).square().mean(0)
+        assert float(known[0]) < 0.1 * float(missed[0])
+    plain = fit.predict(test.q, test.qd, test.tau)
+    error = (plain.mean - test.qdd).abs()
+    assert plain.std is not None and float((error <= 2.0 * plain.std).double().mean(0).min()) > 0.9
+    compiled = fit.compiled().predict(test.q[:20], test.qd[:20], test.tau[:20])
+    torch.testing.assert_close(compiled.mean, plain.mean[:20], rtol=1e-7, atol=1e-9)
+    assert compiled.std is not None
+    torch.testing.assert_close(compiled.std, plain.std[:20], rtol=1e-6, atol=1e-9)
+    fit.save(tmp_path / "fit")
+    again = forcegp.load_model(tmp_path / "fit")
+    assert isinstance(again, StructuredFit)
+    torch.testing.assert_close(again.predict_log(test).mean, fit.predict_log(test).mean)
+
+
+def test_recordings_that_do_not_differ_or_are_unknown_have_no_offsets() -> None:
+    system = forcegp.ConstrainedSystem(forcegp.load_robot("double_pendulum"))
+    parts = [_offset(k, (0.3, -0.2), f"run {k}") for k in range(3)]
+    same = forcegp.StructuredGP(system).fit(forcegp.Dataset.concatenate(parts))
+    assert same.result.worth["recordings of shoulder"] == same.result.worth["recordings of elbow"] == 0.0
+    one = forcegp.Dataset.concatenate([part.named("run") for part in parts])
+    mixed = one.replace(recording=torch.where(one.t < 1.0, UNKNOWN, one.recording))
+    still = [part.replace(q=0.01 * part.q) for part in parts]
+    for data in (one, mixed, forcegp.Dataset.concatenate(still)):
+        spec = forcegp.StructuredGP(system).specification.for_data(data)
+        assert not any(isinstance(prior, OffsetPrior) for prior in spec.priors)
+
+
+def test_a_joint_without_reversal_has_no_offset() -> None:
+    """One way, an offset and dry friction have the same torque."""
+    system = forcegp.ConstrainedSystem(forcegp.load_robot("double_pendulum"))
+    parts = [_offset(k, (0.3, -0.2), f"run {k}") for k in range(3)]
+    turns = torch.tensor([True, False])
+    parts[0] = parts[0].replace(qd=torch.where(turns, parts[0].qd, parts[0].qd.abs()))
+    parts[1] = parts[1].replace(qd=torch.where(turns, parts[1].qd, parts[1].qd.abs()))
+    spec = forcegp.StructuredGP(system).specification.for_data(forcegp.Dataset.concatenate(parts))
+    prior = next(prior for prior in spec.priors if isinstance(prior, OffsetPrior))
+    assert prior.moves == ((True, False), (True, False), (True, True))
+    assert prior.separable == [True, False]
+
+
+def test_what_is_not_constant_or_has_one_name_twice_is_refused() -> None:
     with pytest.raises(ModelError, match="not a prior on constants"):
-        PerRecording(JointForcePrior(), (0, 1))
-    with pytest.raises(ModelError, match="ascending"):
-        PerRecording(PayloadPrior(), (1, 0))
+        PerRecording(JointForcePrior(), ("a", "b"))
+    with pytest.raises(ModelError, match="distinct names"):
+        PerRecording(PayloadPrior(), ("a", "a"))
     with pytest.raises(ModelError, match="standard deviation"):
         DrivePrior(std=0.0)
 

@@ -117,7 +117,7 @@ def file() -> RobotModel:
 
 def found(file: RobotModel, data: forcegp.Dataset) -> Inertia:
     system, prior = forcegp.ConstrainedSystem(file), JointFrictionPrior()
-    return inertia_of(system, prior, AnalyticalMean(), training_of(data, system, (prior,), None, {}))
+    return inertia_of(system, (prior,), AnalyticalMean(), training_of(data, system, (prior,), None, {}))
 
 
 @pytest.mark.parametrize("seed", range(2))

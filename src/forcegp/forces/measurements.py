@@ -18,7 +18,7 @@ from torch import Tensor
 from forcegp import dynamics
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset, farthest_points, standardized
-from forcegp.data.fields import check_robot, contact_table, in_time
+from forcegp.data.fields import UNKNOWN, check_robot, contact_table, in_time
 from forcegp.data.selection import outliers
 from forcegp.errors import DataError, ModelError, UnknownNameError
 from forcegp.forces.priors.base import ForcePrior
@@ -42,6 +42,7 @@ class Measurement:
         values: `(n, d)` measured values.
         segment: `(n,)` trajectory number of each sample; by default, there is one trajectory.
         t: `(n,)` time of each sample [s]; zero by default.
+        recording: `(n,)` number of the recording of each sample; unknown by default.
         tau_std: `(n, nq)` additional standard deviation of each torque [N m, N]; `None` for zero.
         history: `(n, nq, k)` states of bristles, if a prior depends on the past and the log is in time order.
     """
@@ -54,6 +55,7 @@ class Measurement:
     values: Tensor
     segment: Tensor = None  # pyright: ignore[reportAssignmentType]  # filled in below
     t: Tensor = None  # pyright: ignore[reportAssignmentType]  # filled in below
+    recording: Tensor = None  # pyright: ignore[reportAssignmentType]  # filled in below
     tau_std: Tensor | None = None
     history: Tensor | None = None
 
@@ -63,6 +65,8 @@ class Measurement:
             object.__setattr__(self, "segment", zero)
         if self.t is None:
             object.__setattr__(self, "t", torch.zeros_like(self.q[:, 0]))
+        if self.recording is None:
+            object.__setattr__(self, "recording", torch.full_like(self.segment, UNKNOWN))
 
     def __getstate__(self) -> dict[str, object]:
         """Return the fields without the equations of motion that are kept, which other processes compute."""
@@ -86,8 +90,8 @@ class Measurement:
         kept = self.__dict__.get("_kept")
         if kept is not None and kept[0] is system:
             return kept[1]
-        time = torch.stack([self.t, self.segment.to(self.t)], dim=-1)
-        at = states(system, *self.states, qdd=self.values if self.quantity == "qdd" else None, time=time)
+        qdd = self.values if self.quantity == "qdd" else None
+        at = states(system, *self.states, qdd=qdd, recording=self.recording[:, None])
         at = at if self.history is None else dataclasses.replace(at, history=self.history)
         if len(self.q) <= KEPT:
             object.__setattr__(self, "_kept", (system, at))
@@ -102,7 +106,7 @@ class Measurement:
 
     def __getitem__(self, rows: Tensor) -> Measurement:
         """Return the values at the given rows."""
-        parts = (part[rows] for part in (*self.tensors, self.segment, self.t))
+        parts = (part[rows] for part in (*self.tensors, self.segment, self.t, self.recording))
         more = (None if part is None else part[rows] for part in (self.tau_std, self.history))
         return Measurement(self.quantity, *parts, *more)
 
@@ -474,7 +478,7 @@ def measurement_of(
     std = _checked_noise(_noise_of(observation, default_noise), quantity, values)
     state = data.q, data.qd, data.tau, active
     stated = data.extras.get("tau_std")
-    return Measurement(quantity, *state, values, data.segment, data.t, stated), std
+    return Measurement(quantity, *state, values, data.segment, data.t, data.recording, stated), std
 
 
 def _noise_of(observation: Observation, default: NoiseStd | None) -> NoiseStd:

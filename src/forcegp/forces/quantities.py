@@ -37,7 +37,7 @@ class States:
         eom: equations of motion at these states.
         qdd: `(n, nq)` measured accelerations, if known.
         slip: `(n, nq)` sliding direction of each joint, which replaces tanh(q̇/v₀) in dry friction.
-        time: `(n, 2)` time [s] and trajectory number, for states in a training log.
+        recording: `(n, 1)` number of the recording, for states along a log (`Dataset.recording`).
         history: `(n, nq, 2 k)` states of bristles for states along a log (`forces/priors/memory.py`).
         kept: operators that were computed at these states, with their robots and priors, keyed by prior.
     """
@@ -49,7 +49,7 @@ class States:
     eom: Equations
     qdd: Tensor | None = None
     slip: Tensor | None = None
-    time: Tensor | None = None
+    recording: Tensor | None = None
     history: Tensor | None = None
     kept: dict[str, tuple[RobotModel, object, Tensor]] = field(init=False, repr=False, default_factory=dict)
 
@@ -61,11 +61,11 @@ def states(
     tau: Tensor,
     active: Tensor,
     qdd: Tensor | None = None,
-    time: Tensor | None = None,
+    recording: Tensor | None = None,
 ) -> States:
     """Evaluate the equations of motion at a batch of states with nominal torques."""
     tau = system.robot.true_torque(tau)
-    return States(q, qd, tau, active, system.equations(q, qd, active), qdd, time=time)
+    return States(q, qd, tau, active, system.equations(q, qd, active), qdd, recording=recording)
 
 
 ForceField = Callable[[ConstrainedSystem, States], Tensor]
@@ -80,6 +80,7 @@ class FlatStates(NamedTuple):
         active: `(n, n_contacts)` bool, closed contacts.
         batch: original batch shape; its product is n.
         history: `(n, nq, k)` states of bristles, for states along a log.
+        recording: `(n, 1)` number of the recording, for states along a log.
     """
 
     q: Tensor
@@ -88,16 +89,17 @@ class FlatStates(NamedTuple):
     active: Tensor
     batch: torch.Size
     history: Tensor | None = None
+    recording: Tensor | None = None
 
     def rows(self, index: slice) -> FlatStates:
         """Return the states in the given slice."""
-        past = None if self.history is None else self.history[index]
         q, qd, tau, active = (x[index] for x in (self.q, self.qd, self.tau, self.active))
-        return FlatStates(q, qd, tau, active, self.batch, past)
+        along = (x if x is None else x[index] for x in (self.history, self.recording))
+        return FlatStates(q, qd, tau, active, self.batch, *along)
 
     def with_equations(self, system: ConstrainedSystem) -> States:
         """Return the states with their equations of motion."""
-        at = states(system, self.q, self.qd, self.tau, self.active)
+        at = states(system, self.q, self.qd, self.tau, self.active, recording=self.recording)
         return at if self.history is None else replace(at, history=self.history)
 
 

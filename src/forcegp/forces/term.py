@@ -73,6 +73,7 @@ class JointState:
         load: |Q_G|, the magnitude of the gravity force [N m, N].
         slip: direction of motion of a joint that may stick, which replaces tanh(q̇/v) in dry friction.
         history: states z of bristles along a log, one array per distance, or `None` for a state without past.
+        recording: number of the recording `(n, 1)`, or `None` if it is unknown.
     """
 
     q: Array
@@ -80,6 +81,7 @@ class JointState:
     load: Array
     slip: Array | None = None
     history: Sequence[Array] | None = None
+    recording: Tensor | None = None
 
     def direction(self, speed: float = SHARPEST) -> Array:
         """Return the direction of motion, tanh(q̇/v) for a saturation speed v [rad/s, m/s]."""
@@ -166,5 +168,5 @@ class JointTerm(PerJointPrior):
         robot = system.robot
         history = None if at.history is None else at.history.unbind(-1)
         q, qd, load = robot.drive_motion(at.q), robot.drive_motion(at.qd), robot.drive_torque(at.eom.Q_G)
-        x = JointState(q, qd, load.abs(), at.slip, history)
+        x = JointState(q, qd, load.abs(), at.slip, history, at.recording)
         return {name: column[..., None] for name, column in self.columns(x).items()}

@@ -179,7 +179,7 @@ class Columns(Linear):
     def initial(self, outputs: int, widths: Mapping[str, int], log_std: Tensor | float = 0.0) -> Initial:
         width = width_of(self.inputs, widths)
         share = torch.zeros(outputs, dtype=torch.float64) + log_std - 0.5 * math.log(width)
-        return {"log_slope_std": share[:, None].repeat(1, width)}
+        return {"log_slope_std": share[:, None].repeat(1, width if self.ard else 1)}
 
     def bias_std(self, params: Parameters) -> Tensor:
         return torch.zeros_like(self.slope_std(params)[:, 0])

@@ -82,7 +82,7 @@ class Evidence:
 def _entries(kernel: Kernel, components: int, width: int) -> list[list[tuple[str, tuple[int, ...]]]]:
     """Return the name and index of the scale of each basis function of each component."""
     if isinstance(kernel, Columns):
-        return [[("log_slope_std", (k, d)) for d in range(width)] for k in range(components)]
+        return [[("log_slope_std", (k, d * kernel.ard)) for d in range(width)] for k in range(components)]
     if isinstance(kernel, Linear) and kernel.ard and not kernel.shared and kernel.offset is None:
         slopes = [[("log_slope_std", (k, d)) for d in range(width - 1)] for k in range(components)]
         return [[*row, ("log_bias_std", (k,))] for k, row in enumerate(slopes)]
@@ -196,7 +196,9 @@ def without_idle(
         costs = []
         for family in left:
             columns = torch.cat([groups[g].columns for g in family])
-            seen = float(found.determined[torch.tensor(family)].sum()) > DETERMINED * len(columns)
+            # A column that is zero in the log, such as that of an unknown recording, has no evidence.
+            acts = int((sums.G.diagonal()[columns] > 0.0).sum())
+            seen = float(found.determined[torch.tensor(family)].sum()) > DETERMINED * acts
             costs.append(worth(found, columns) if seen else 0.0)
         if not costs or min(costs) >= -DECISIVE:
             return found, kept

@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import scipy
@@ -34,10 +34,9 @@ from forcegp.forces.noise import TORQUE_NOISE
 from forcegp.forces.posterior import ForcePosterior
 from forcegp.forces.priors.base import ForceMean
 from forcegp.forces.priors.inertial import InertialPrior
-from forcegp.forces.priors.joint import JointFrictionPrior
 from forcegp.forces.priors.ripple import ripple_of
 from forcegp.forces.problem import Problem, force_posterior, typical
-from forcegp.forces.term import JointState
+from forcegp.forces.term import JointState, JointTerm
 from forcegp.gp.features import Block
 from forcegp.identification import MASS_SHARE, regressor
 from forcegp.learning.correlation import autocorrelation_time
@@ -428,7 +427,7 @@ class Inertia:
 @torch.no_grad()
 def inertia_of(
     system: ConstrainedSystem,
-    friction: JointFrictionPrior,
+    laws: Sequence[JointTerm],
     mean: ForceMean,
     training: Training,
     scale_std: float | None = None,
@@ -442,7 +441,7 @@ def inertia_of(
 
     Args:
         system: robot and contacts of the robot file.
-        friction: prior that defines the features of joint friction.
+        laws: friction of joints, and offsets of recordings.
         mean: prior mean of Q, including the motor torque.
         training: samples in motion.
         scale_std: standard deviation of the relative scale of torques that are not measured.
@@ -453,7 +452,7 @@ def inertia_of(
         spread = () if scale_std is None else (scale_std,) * system.robot.nq
         unknown = dataclasses.replace(_errors(system.robot, size), is_error=bool(system.robot.driven.all()))
         return Inertia(system.robot, unknown if links else None, (), spread)
-    rows = free_rows(system, friction, mean, training).with_memory()
+    rows = free_rows(system, laws, mean, training).with_memory()
     rows = with_ripple(system.robot, rows)
     if scale_std is None:
         return rigid_robot(system.robot, rows)

@@ -27,6 +27,7 @@ from forcegp.forces.measurements import Measurement, Training
 from forcegp.forces.priors import memory
 from forcegp.forces.priors.base import ForceMean, ForcePrior
 from forcegp.forces.priors.joint import JointFrictionPrior
+from forcegp.forces.term import JointTerm
 from forcegp.learning.held_out import stretches
 
 LEAST, MOST = 200, 4000
@@ -180,7 +181,7 @@ Estimate = Callable[[NormalEquations], Tensor]
 
 
 def free_rows(
-    system: ConstrainedSystem, prior: JointFrictionPrior, mean: ForceMean, training: Training
+    system: ConstrainedSystem, laws: Sequence[JointTerm], mean: ForceMean, training: Training
 ) -> Rows:
     """Return samples in free motion, and their partners, from the first measurement with enough of them."""
     motions = (m for m in training.measurements if m.quantity == "qdd")
@@ -196,10 +197,10 @@ def free_rows(
     _, group = stretches(m.segment[first]).unique(return_inverse=True)
     i = torch.arange(len(first), device=m.t.device)
     if not paired:
-        return _rows(system, prior, mean, m[first], memory[first], rate[first], group, i)
+        return _rows(system, laws, mean, m[first], memory[first], rate[first], group, i)
     both, n = torch.cat([first, later[first]]), len(first)
     partner = torch.cat([i + n, i])
-    rows = _rows(system, prior, mean, m[both], memory[both], rate[both], group.repeat(2), partner)
+    rows = _rows(system, laws, mean, m[both], memory[both], rate[both], group.repeat(2), partner)
     step = max(0.0, float(m.t[first].diff().median()))
     return dataclasses.replace(rows, step=step, filter_variance=training.filter_variance)
 
@@ -278,7 +279,7 @@ def partners(m: Measurement, filter_span: float = 0.0) -> Tensor:
 
 def _rows(
     system: ConstrainedSystem,
-    prior: JointFrictionPrior,
+    laws: Sequence[JointTerm],
     mean: ForceMean,
     m: Measurement,
     memory: Tensor,
@@ -287,12 +288,14 @@ def _rows(
     partner: Tensor,
 ) -> Rows:
     at, robot = m.at(system), system.robot
-    Phi = torch.cat([*prior.features(system, at).values(), torch.ones_like(at.q)[..., None]], dim=-1)
+    columns = [column for law in laws for column in law.features(system, at).values()]
+    Phi = torch.cat([*columns, torch.ones_like(at.q)[..., None]], dim=-1)
     Phi, memory = (x / x.square().mean(0).sqrt().clamp(min=1e-12) for x in (Phi, memory))
     Phi, memory = (robot.driven[:, None] * x for x in (Phi, memory))
     residual = robot.drive_torque(mean(system, at) - (at.eom.M @ m.values[..., None])[..., 0])
     qd, qdd, tau = robot.drive_motion(m.qd), robot.drive_motion(m.values), robot.drive_torque(m.tau)
-    weight = rest_weight(qd.abs(), min(prior.speeds), Phi, residual)
+    slowest = min(min(law.speeds) for law in laws if isinstance(law, JointFrictionPrior))
+    weight = rest_weight(qd.abs(), slowest, Phi, residual)
     return Rows(m.q, qd, qdd, residual, Phi, weight, group, m.segment, partner, memory, tau, rate)
 
 

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
-from forcegp.data.fields import common_stick_speeds
+from forcegp.data.fields import UNKNOWN, common_recordings, common_stick_speeds, recording_number
 from forcegp.errors import ModelError, check_name
 from forcegp.forces.measurements import (
     Observation,
@@ -29,7 +29,7 @@ from forcegp.forces.measurements import (
 from forcegp.forces.noise import Noise, external_std, state_std_of
 from forcegp.forces.posterior import REGION
 from forcegp.forces.priors.base import ANALYTICAL, COULOMB, NOISE, ForcePrior
-from forcegp.forces.priors.constants import DrivePrior
+from forcegp.forces.priors.constants import DrivePrior, OffsetPrior, PerRecording
 from forcegp.forces.priors.inertial import InertialPrior
 from forcegp.forces.priors.joint import AnalyticalMean, ConstantForcePrior, JointFrictionPrior
 from forcegp.forces.priors.memory import DISTANCES, LONGEST_STEP, PAST, BristlePrior
@@ -103,6 +103,7 @@ class Specification:
         )
         known = any(prior.remembers for prior in self.priors)
         priors = (*self.priors, BristlePrior()) if past and not known else self.priors
+        priors = (*priors, *_of_recordings(observations, priors, self.system.robot))
         scale = max(o.data.header.torque_scale_std or 0.0 for o in observations)
         if scale and not any(isinstance(prior, DrivePrior) for prior in priors):
             priors = (*priors, DrivePrior(std=scale))
@@ -126,14 +127,15 @@ class Specification:
 
     def inertia_of(self, training: Training) -> Inertia:
         """Return the inertia identified from the training samples if requested, or that of the robot file."""
-        friction = next((prior for prior in self.priors if isinstance(prior, JointFrictionPrior)), None)
+        laws = [prior for prior in self.priors if isinstance(prior, JointFrictionPrior | OffsetPrior)]
         scale = next((prior.std for prior in self.priors if isinstance(prior, DrivePrior)), None)
         links = self.options.inertia == "auto"
         known = "actuation" in self.mean.terms and self.analytical_parameters is None
         asks = known and (links or (self.automatic and scale is not None))
-        if friction is None or not asks or any(isinstance(prior, InertialPrior) for prior in self.priors):
+        lacks = not any(isinstance(law, JointFrictionPrior) for law in laws)
+        if lacks or not asks or any(isinstance(prior, InertialPrior) for prior in self.priors):
             return Inertia(self.system.robot)
-        found = inertia_of(self.system, friction, self.mean, training, scale, links)
+        found = inertia_of(self.system, laws, self.mean, training, scale, links)
         checked = training.free_motions >= LEAST or not bool(self.system.robot.driven.all())
         return found if checked else replace(found, doubts=_unchecked_masses(training))
 
@@ -157,6 +159,23 @@ class Specification:
             state_std=state_std_of(noise.state, robot),
             external_std=external_std(noise.external, robot),
         )
+
+
+def _of_recordings(
+    observations: Sequence[Observation], priors: Sequence[ForcePrior], robot: RobotModel
+) -> tuple[ForcePrior, ...]:
+    """Return the terms that differ between recordings, if each sample belongs to one of several."""
+    known = any(isinstance(prior, OffsetPrior | PerRecording) for prior in priors)
+    unnamed = any(bool((o.data.recording == UNKNOWN).any()) for o in observations)
+    common_recordings([o.data.header for o in observations])
+    names = tuple(dict.fromkeys(name for o in observations for name in o.data.recordings))
+    if known or unnamed or len(names) < 2:
+        return ()
+    q, qd = (robot.drive_motion(torch.cat([getattr(o.data, x) for o in observations])) for x in ("q", "qd"))
+    recording = torch.cat([o.data.recording for o in observations])
+    own = (recording == recording_number(name) for name in names)
+    offsets = OffsetPrior(names, tuple(tuple(reverses(q[rows], qd[rows])) for rows in own))
+    return (offsets,) if any(offsets.separable) else ()
 
 
 def _unchecked_masses(training: Training) -> tuple[str, ...]:
@@ -264,8 +283,19 @@ def training_for(
 def still_joints(observations: Iterable[Observation]) -> list[bool]:
     """Return for each joint whether it rests within the least distance over which friction builds up."""
     q, qd = (torch.cat([getattr(o.data, name) for o in observations]) for name in ("q", "qd"))
-    ends = q[:: max(1, len(q) // SAMPLED)].quantile(torch.tensor([OUTERMOST, 1.0 - OUTERMOST]).to(q), dim=0)
-    return ((qd.abs().amax(0) < REST_SPEED) & (ends.diff(dim=0)[0] < DISTANCES[0])).tolist()
+    return ((qd.abs().amax(0) < REST_SPEED) & (travel(q) < DISTANCES[0])).tolist()
+
+
+def travel(q: Tensor) -> Tensor:
+    """Return the range `(...)` of positions `(n, ...)`, without outliers."""
+    share = torch.tensor([OUTERMOST, 1.0 - OUTERMOST]).to(q)
+    return q[:: max(1, len(q) // SAMPLED)].quantile(share, dim=0).diff(dim=0)[0]
+
+
+def reverses(q: Tensor, qd: Tensor) -> list[bool]:
+    """Return for each joint whether its friction develops in both directions."""
+    ways = ([x[sign * v > REST_SPEED] for sign in (1.0, -1.0)] for x, v in zip(q.mT, qd.mT, strict=True))
+    return [all(len(x) > 0 and float(travel(x)) > DISTANCES[-1] for x in both) for both in ways]
 
 
 def still_of(spec: Specification, scales: Mapping[str, Standardization]) -> list[bool]:

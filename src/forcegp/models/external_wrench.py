@@ -344,7 +344,8 @@ class Reading:
         data, fit, system = self.data[rows], self.fit, self.fit.system
         active = data.active(system.contact_names)
         at, _ = states_at(system, data.q, data.qd, data.tau, active)
-        at = dataclasses.replace(at, qdd=qdd, history=None if self.history is None else self.history[rows])
+        history = None if self.history is None else self.history[rows]
+        at = dataclasses.replace(at, qdd=qdd, history=history, recording=data.recording[:, None])
         mean, S, force, A = self._learned(at)
         unknown = unknown_variance(fit.hyperparameters, at, fit.problem.external_std)
         stated = data.extras.get("tau_std")

@@ -22,7 +22,7 @@ from forcegp.forces.measurements import Measurement, Training, plain
 from forcegp.forces.noise import Noise
 from forcegp.forces.posterior import ForcePosterior
 from forcegp.forces.priors.base import ANALYTICAL
-from forcegp.forces.priors.constants import DrivePrior, PerRecording
+from forcegp.forces.priors.constants import DrivePrior, OffsetPrior, PerRecording
 from forcegp.forces.priors.contact import ContactForcePrior, NormalForcePrior, SlidingFrictionPrior
 from forcegp.forces.priors.inertial import InertialPrior, PayloadPrior
 from forcegp.forces.priors.joint import AnalyticalMean, JointForcePrior
@@ -74,11 +74,9 @@ def classes() -> dict[str, type]:
 
 COLUMNS = ("q", "qd", "tau", "active", "values")
 """Saved parts of each measurement."""
-IN_TIME = ("segment", "t")
-"""Additional parts that are saved if a prior depends on the time or the recording."""
 NOT_REAL = (
     (re.compile(r"data\.\d+\.active"), torch.bool),
-    (re.compile(r"added|data\.\d+\.segment|sparse\..*\.(components|dropped)"), torch.int64),
+    (re.compile(r"added|data\.\d+\.recording|sparse\..*\.(components|dropped)"), torch.int64),
 )
 """Name patterns and types of the tensors that do not contain real numbers."""
 Parts = tuple[
@@ -180,8 +178,8 @@ def _conditioned_on(spec: Specification, training: Training, posterior: ForcePos
 
 def _columns(spec: Specification) -> tuple[str, ...]:
     """Return the saved parts of each measurement."""
-    dated = any(isinstance(prior, PerRecording) for prior in spec.priors)
-    return COLUMNS + (IN_TIME if dated else ())
+    several = any(isinstance(prior, PerRecording | OffsetPrior) for prior in spec.priors)
+    return (*COLUMNS, "recording") if several else COLUMNS
 
 
 def _kept(hyper: Mapping[str, Tensor], own: AnalyticalParameters | None) -> dict[str, Tensor]:
@@ -251,7 +249,7 @@ def _training(settings: StructuredSettings, spec: Specification, tensors: Mappin
         m = Measurement(quantity, **{name: part[name] for name in _columns(spec)})
         (n, d), nq = m.values.shape, spec.system.robot.nq
         shapes = {"q": (n, nq), "qd": (n, nq), "tau": (n, nq), "active": (n, len(spec.system.contacts))}
-        shapes |= {"segment": (n,), "t": (n,), "weight": (n,), "slope": (n, d, 2 * nq)}
+        shapes |= {"recording": (n,), "weight": (n,), "slope": (n, d, 2 * nq)}
         shapes["noise_std"] = (d,) if part["noise_std"].ndim == 1 else (n, d)
         for name, shape in shapes.items():
             if name in part and part[name].shape != shape:

@@ -29,6 +29,7 @@ from forcegp.forces.posterior import (
     unknown_variance,
 )
 from forcegp.forces.priors.base import ForcePrior
+from forcegp.forces.priors.constants import PerRecording
 from forcegp.forces.priors.inertial import InertialPrior
 from forcegp.forces.priors.memory import bristles
 from forcegp.forces.problem import Problem, forces_and_constant, is_sparse, lost_by_inducing, typical
@@ -118,7 +119,11 @@ class StructuredFit(FittedModel):
         system = query.system or self.system
         unseen = self.result.never_closed if query.system is None else ()
         at = flat.with_equations(system)
-        if query.covariance and any(isinstance(prior, InertialPrior) for prior in self.posterior.priors):
+        if at.recording is not None and any(
+            isinstance(prior, PerRecording) for prior in self.posterior.priors
+        ):
+            at = self._consistent(system, at)
+        elif query.covariance and any(isinstance(prior, InertialPrior) for prior in self.posterior.priors):
             # Inertia errors are multiplied by the predicted acceleration.
             qdd = self.posterior.read_mean(system, at, affine_map(system, at, "qdd"))
             at = dataclasses.replace(at, qdd=qdd)
@@ -131,6 +136,19 @@ class StructuredFit(FittedModel):
         if hidden is None:
             return (mean, spread, beyond, torch.ones_like(mean, dtype=torch.bool)), parts, ()
         return (*hidden.applied(mean, spread), beyond, ~hidden.whole), parts, hidden.doubts
+
+    def _consistent(self, system: ConstrainedSystem, at: States) -> States:
+        """Return states at the accelerations that solve q̈ = f(q̈), where forces are affine in q̈."""
+        z = affine_map(system, at, "qdd")
+
+        def mean(qdd: Tensor) -> Tensor:
+            return self.posterior.read_mean(system, dataclasses.replace(at, qdd=qdd), z)
+
+        zero = torch.zeros_like(at.q)
+        free = mean(zero)
+        slopes = torch.stack([mean(zero + e) - free for e in torch.eye(zero.shape[-1]).to(zero)], dim=-1)
+        qdd = torch.linalg.solve(torch.eye(zero.shape[-1]).to(zero) - slopes, free[..., None])[..., 0]
+        return dataclasses.replace(at, qdd=qdd)
 
     def _read(
         self, system: ConstrainedSystem, at: States, z: AffineMap, parts: Mapping[str, slice], noise: bool
@@ -173,10 +191,11 @@ class StructuredFit(FittedModel):
         covariance: bool = True,
         noise: bool = False,
     ) -> Prediction:
-        """Predict quantities along a log in time order, including friction with memory.
+        """Predict quantities along a log in time order, with friction with memory and offsets of recordings.
 
         The state of a bristle follows from the velocities before a sample (`forces/priors/memory.py`), which
-        a single state does not contain.
+        a single state does not contain. Constants of a recording are those of the training recording with
+        the same name. In other recordings, they are unknown (`forces/priors/constants.py`).
 
         Args:
             data: the log, with the measured torques.
@@ -194,7 +213,8 @@ class StructuredFit(FittedModel):
         active, history = data.active(self.system.contact_names), None
         if any(prior.remembers for prior in self.force_priors):
             history = bristles(data.t, self.system.robot.drive_motion(data.qd), data.segment)
-        flat = flat_states(self.system, data.q, data.qd, data.tau, active)._replace(history=history)
+        flat = flat_states(self.system, data.q, data.qd, data.tau, active)
+        flat = flat._replace(history=history, recording=data.recording[:, None])
         with torch.no_grad():
             return self._answered(flat, Query(quantity, None, covariance, noise))
 

@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
+from forcegp.data.fields import recording_number
 from forcegp.errors import ModelError
 from forcegp.forces.priors.base import JOINT, ForcePrior
-from forcegp.forces.priors.joint import ConstantForcePrior
+from forcegp.forces.priors.joint import OFFSET, ConstantForcePrior
 from forcegp.forces.quantities import States
-from forcegp.gp.kernels import Constant, Kernel
+from forcegp.forces.term import Array, JointState, JointTerm, constants
+from forcegp.gp.kernels import Columns, Constant, Kernel
 from forcegp.robot.model import RobotModel
 
 
@@ -75,57 +80,118 @@ class DrivePrior(ConstantForcePrior):
 
 
 @dataclass(frozen=True)
+class OffsetPrior(JointTerm):
+    """A prior on offsets of each torque that differ between recordings, such as those of a torque sensor.
+
+    Q_i = o_ir in recording r, with o_ir ~ N(0, s_i²). The evidence determines s_i from all recordings. In a
+    recording that is not in the training data, o_i is unknown, with the standard deviation s_i. If a fit is
+    updated with such a recording, o_i is that of this recording.
+
+    Args:
+        recordings: names of the recordings, as in `Dataset.recordings`.
+        moves: whether each joint moves both ways in each recording; by default, all do. Otherwise, an offset
+            cannot be separated from friction. A joint that does so in fewer than two recordings has none.
+        kernel: covariance of each component.
+        name: prefix of the hyperparameters.
+
+    Example:
+        >>> OffsetPrior(recordings=("monday", "tuesday")).name
+        'recordings'
+    """
+
+    recordings: tuple[str, ...] = ()
+    moves: tuple[tuple[bool, ...], ...] = ()
+    kernel: Kernel = field(default_factory=lambda: Columns(ard=False))
+    name: str = "recordings"
+
+    sticks = False
+    scaled = False
+
+    def columns(self, x: JointState) -> dict[str, Array]:
+        every, zero = np.array(self.separable, dtype=float), x.qd * 0.0
+        moves = [*(self.moves or [every] * len(self.recordings)), every]
+        each = zip((*self.recordings, ""), shares(self.recordings, x.recording), moves, strict=True)
+        return {
+            f"offset_{name}" if name else "offset": (zero + share) * constants(x.qd, every * own)
+            for name, share, own in each
+        }
+
+    @property
+    def separable(self) -> list[bool]:
+        """Whether each joint has offsets."""
+        return [sum(column) > 1 for column in zip(*self.moves, strict=True)] or [True]
+
+    def stated(self, initial: dict[str, Tensor]) -> dict[str, Tensor]:
+        own = math.log(OFFSET) + 0.5 * math.log(1 + len(self.recordings))
+        return {name: value + own for name, value in initial.items()}
+
+
+def shares(recordings: Sequence[str], numbers: Tensor | None) -> Sequence[Tensor | float]:
+    """Return for each recording whether it is that of each state, and whether none of them is.
+
+    Args:
+        recordings: names of the recordings.
+        numbers: numbers of the recordings of the states `(n, 1)`, or `None` if they are unknown.
+    """
+    if numbers is None:
+        return [*(0.0 for _ in recordings), 1.0]
+    own = [(numbers == recording_number(name)).double() for name in recordings]
+    return [*own, 1.0 - sum(own)]
+
+
+@dataclass(frozen=True)
 class PerRecording(ForcePrior):
     """A prior on constants that differ between recordings, such as a payload.
 
     All other priors are common to the recordings, so a fit to several recordings learns friction from all of
-    them. Predictions use the constants of the last recording.
+    them. The constants of all recordings have common scales. In a recording that is not in the training data,
+    the constants are unknown.
 
     Args:
         prior: prior on the force in each recording; it also provides the names of the hyperparameters.
-        starts: first segment of each recording, as in `Dataset.segment`.
+        recordings: names of the recordings, as in `Dataset.recordings`.
 
     Example:
         >>> import forcegp
-        >>> prior = PerRecording(forcegp.PayloadPrior(measured=True), starts=(0, 1))
+        >>> prior = PerRecording(forcegp.PayloadPrior(measured=True), ("monday", "tuesday"))
         >>> prior.outputs(forcegp.load_robot("ur5"))
-        8
+        12
 
     Raises:
-        ModelError: `starts` is not increasing, or `prior` is not a prior on constants.
+        ModelError: a recording is named twice, or `prior` is not a prior on constants.
     """
 
     prior: ForcePrior
-    starts: tuple[int, ...]
+    recordings: tuple[str, ...]
     name: str = field(init=False)
     kernel: Kernel = field(init=False)
     target: str = field(init=False)
 
     def __post_init__(self) -> None:
-        if not self.starts or list(self.starts) != sorted(set(self.starts)):
-            raise ModelError("recordings need ascending first segments", expected="(0, 1)", got=self.starts)
+        if not self.recordings or len(set(self.recordings)) < len(self.recordings):
+            raise ModelError("recordings need distinct names", expected="one or more", got=self.recordings)
         if not isinstance(self.prior.kernel, Constant):
             raise ModelError(
                 f"force prior {self.prior.name!r} is not a prior on constants",
                 expected="a prior with a Constant kernel, such as PayloadPrior()",
                 got=type(self.prior.kernel).__name__,
             )
-        for name in ("name", "kernel", "target"):
+        for name in ("name", "target"):
             object.__setattr__(self, name, getattr(self.prior, name))
+        places = len(self.recordings) + 1
+        object.__setattr__(self, "kernel", Constant(group=places * self.prior.kernel.group))
 
     def outputs(self, robot: RobotModel) -> int:
-        return len(self.starts) * self.prior.outputs(robot)
+        return (len(self.recordings) + 1) * self.prior.outputs(robot)
 
     def features(self, system: ConstrainedSystem, at: States) -> dict[str, Tensor]:
         return self.prior.features(system, at)
 
     def operator(self, system: ConstrainedSystem, at: States) -> Tensor:
-        recording = torch.full((len(at.q),), len(self.starts) - 1, device=at.q.device)
-        if at.time is not None:
-            starts, segment = torch.tensor(self.starts, device=at.q.device), at.time[:, 1].long()
-            recording = (segment[:, None] >= starts).sum(-1).sub(1).clamp(min=0)
-        mine = torch.nn.functional.one_hot(recording, len(self.starts)).to(at.q)
-        return (mine[:, None, :, None] * self.prior.operator(system, at)[:, :, None]).flatten(2)
+        E = self.prior.operator(system, at)
+        each = shares(self.recordings, at.recording)
+        mine = torch.cat([torch.as_tensor(x).to(E).expand(len(E), 1) for x in each], dim=-1)
+        return (E[..., None] * mine[:, None, None]).flatten(2)
 
     def check(self, system: ConstrainedSystem) -> None:
         self.prior.check(system)
