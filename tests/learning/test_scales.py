@@ -76,7 +76,7 @@ def test_variances_of_few_independent_samples_are_the_stated_ones() -> None:
     now = torch.full((1,), math.log(0.1), dtype=torch.float64)
 
     def found(power: float) -> tuple[float, Tensor]:
-        known = Stated(stated, power, torch.ones_like(stated))
+        known = Stated(stated, power, torch.ones_like(stated), torch.zeros(8, dtype=torch.bool))
         return _at_likeliest_speed(data, contact, now, AT_REST, learned, known)[1:]
 
     few = found(0.5 * FEWEST / ROWS)

@@ -64,8 +64,9 @@ def free_log(robot: forcegp.RobotModel, n: int) -> forcegp.Dataset:
 
 
 def free_friction() -> StructuredFit:
-    """The default model of a measured robot, with everything that it learns."""
+    """The default model of a measured robot with polynomial damping, with everything that it learns."""
     robot = forcegp.load_robot("kuka_iiwa")
+    robot = robot.replace(drag=robot.mass.new_tensor([[0.2, 0.3]]).expand(robot.nq, 2))
     system = forcegp.ConstrainedSystem(robot)
     model = forcegp.StructuredGP(system, mean="analytical", force_priors=friction_priors(system))
     return model.fit(free_log(robot, 120), options=forcegp.LearningOptions(max_evaluations=15))
@@ -89,10 +90,8 @@ def uncertain_inertia() -> StructuredFit:
 
 
 def one_contact() -> StructuredFit:
-    """Friction of the joints, whose damping is polynomial, and, coupled with the multiplier, of a contact."""
-    robot = two_contacts().robot
-    robot = robot.replace(drag=robot.mass.new_tensor([[0.2, 0.3]]).expand(robot.nq, 2))
-    system = forcegp.ConstrainedSystem(robot, two_contacts().contacts[:1], forcegp.Baumgarte())
+    """Friction of the joints and, coupled with the multiplier, of a contact."""
+    system = forcegp.ConstrainedSystem(two_contacts().robot, two_contacts().contacts[:1], forcegp.Baumgarte())
     noise = forcegp.Noise(0.1, torque=0.3, external={"lbr_iiwa_joint_2": 0.5})
     model = forcegp.StructuredGP(system, "analytical", friction_priors(system), noise=noise)
     return model.fit(logged(two_contacts(), 60), learn=[])
