@@ -164,7 +164,10 @@ class Specification:
 def _of_recordings(
     observations: Sequence[Observation], priors: Sequence[ForcePrior], robot: RobotModel
 ) -> tuple[ForcePrior, ...]:
-    """Return the terms that differ between recordings, if each sample belongs to one of several."""
+    """Return the terms that differ between recordings, if each sample belongs to one of several.
+
+    In contact, an offset cannot be told from contact forces, which balance it.
+    """
     known = any(isinstance(prior, OffsetPrior | PerRecording) for prior in priors)
     unnamed = any(bool((o.data.recording == UNKNOWN).any()) for o in observations)
     common_recordings([o.data.header for o in observations])
@@ -173,7 +176,8 @@ def _of_recordings(
         return ()
     q, qd = (robot.drive_motion(torch.cat([getattr(o.data, x) for o in observations])) for x in ("q", "qd"))
     recording = torch.cat([o.data.recording for o in observations])
-    own = (recording == recording_number(name) for name in names)
+    free = torch.cat([~o.data.active(o.data.contact_names).any(-1) for o in observations])
+    own = (free & (recording == recording_number(name)) for name in names)
     offsets = OffsetPrior(names, tuple(tuple(reverses(q[rows], qd[rows])) for rows in own))
     return (offsets,) if any(offsets.separable) else ()
 
