@@ -199,7 +199,9 @@ def test_recordings_that_do_not_differ_or_are_unknown_have_no_offsets() -> None:
     one = forcegp.Dataset.concatenate([part.named("run") for part in parts])
     mixed = one.replace(recording=torch.where(one.t < 1.0, UNKNOWN, one.recording))
     still = [part.replace(q=0.01 * part.q) for part in parts]
-    for data in (one, mixed, forcegp.Dataset.concatenate(still)):
+    closed = torch.ones(len(parts[0]), dtype=torch.bool)
+    touching = [part.replace(contact={"floor": closed}) for part in parts]
+    for data in (one, mixed, *map(forcegp.Dataset.concatenate, (still, touching))):
         spec = forcegp.StructuredGP(system).specification.for_data(data)
         assert not any(isinstance(prior, OffsetPrior) for prior in spec.priors)
 
