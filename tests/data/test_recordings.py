@@ -26,29 +26,36 @@ def imported(folder: Path, shift: float = 0.0) -> forcegp.Dataset:
     return import_log(path, ROBOT, parse_mapping(toml.encode(), "m.toml")).data
 
 
-def test_an_imported_log_is_a_recording_named_by_its_file(tmp_path: Path) -> None:
+def test_an_imported_log_is_a_recording_named_by_its_file_and_hash(tmp_path: Path) -> None:
     data = imported(tmp_path / "a")
-    assert data.recordings == ("run",) and set(data.header.recordings) == {"run"}
+    ((name, log),) = data.header.recordings.items()
+    assert data.recordings == (name,) and name == f"run-{log[:6]}" and len(log) > 6
     data.write(tmp_path / "a.parquet")
     again = forcegp.Dataset.read(tmp_path / "a.parquet")
-    assert again.recordings == ("run",) and again.header.recordings == data.header.recordings
-    assert bool((again.recording == recording_number("run")).all())
+    assert again.recordings == (name,) and again.header.recordings == data.header.recordings
+    assert bool((again.recording == recording_number(name)).all())
 
 
-def test_two_logs_with_one_name_are_refused_and_renamed(tmp_path: Path) -> None:
+def test_files_with_one_name_are_two_recordings(tmp_path: Path) -> None:
     first, second = imported(tmp_path / "a"), imported(tmp_path / "b", 0.1)
+    both = forcegp.Dataset.concatenate([first, second])
+    assert both.recordings == (*first.recordings, *second.recordings) and len(set(both.recordings)) == 2
+    same = forcegp.Dataset.concatenate([first[:50], first[80:], imported(tmp_path / "c")])
+    assert same.recordings == first.recordings
+
+
+def test_two_logs_with_one_given_name_are_refused_and_renamed(tmp_path: Path) -> None:
+    first, second = imported(tmp_path / "a").named("run"), imported(tmp_path / "b", 0.1).named("run")
     with pytest.raises(DataError, match="two recordings are named 'run'") as raised:
         forcegp.Dataset.concatenate([first, second])
     assert raised.value.hint is not None and "named" in raised.value.hint
     both = forcegp.Dataset.concatenate([first, second.named("later")])
     assert both.recordings == ("run", "later")
     assert both[both.recording == recording_number("later")].recordings == ("later",)
-    same = forcegp.Dataset.concatenate([first[:50], first[80:], imported(tmp_path / "c")])
-    assert same.recordings == ("run",)
 
 
 def test_observations_of_two_logs_with_one_name_are_refused(tmp_path: Path) -> None:
-    logs = imported(tmp_path / "a"), imported(tmp_path / "b", 0.1)
+    logs = [imported(tmp_path / name, shift).named("run") for name, shift in (("a", 0.0), ("b", 0.1))]
     model = forcegp.StructuredGP(forcegp.ConstrainedSystem(ROBOT))
     with pytest.raises(DataError, match="two recordings are named 'run'"):
         model.fit([forcegp.Observation(log) for log in logs])
@@ -61,7 +68,8 @@ def test_a_column_numbers_the_recordings_of_a_log(tmp_path: Path) -> None:
     path.write_text("\n".join([f"{lines[0]},take", *rows]) + "\n")
     mapped = toml.replace('column = "t"\n', 'column = "t"\nrecording = "take"\n', 1)
     data = import_log(path, ROBOT, parse_mapping(mapped.encode(), "m.toml")).data
-    assert data.recordings == ("run 7", "run 9")
+    (log,) = set(data.header.recordings.values())
+    assert data.recordings == (f"run-{log[:6]} 7", f"run-{log[:6]} 9")
     change = int(np.flatnonzero(data.recording.diff().numpy())[0]) + 1
     assert float(data.t[change]) == pytest.approx(1.2) and bool(data.segment.diff()[change - 1])
     path.write_text(path.read_text().replace(",7\n", ",7.5\n"))

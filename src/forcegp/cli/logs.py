@@ -46,7 +46,7 @@ def import_(
         ),
     ] = None,
     recording: Annotated[
-        str | None, Option(help="Name of the recording; default: that of the log without its ending.")
+        str | None, Option(help="Name of the recording; default: that of the log with its hash.")
     ] = None,
     as_json: AsJson = False,
 ) -> None:

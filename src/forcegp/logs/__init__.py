@@ -49,6 +49,8 @@ __all__ = [
 
 NUMBERS = 16
 """Upper bound on the number of values held in memory per joint and row. Ten were measured."""
+DIGITS = 6
+"""Number of digits of a log's hash in the name of its recording."""
 
 
 @dataclass(frozen=True)
@@ -260,8 +262,11 @@ def _dataset(
 
 
 def _recordings(signals: Signals, report: ImportReport) -> tuple[dict[str, str], NDArray[np.int64]]:
-    """Return the recordings, named by the log and their numbers in it, and that of each row (n,)."""
-    stem = Path(report.source).stem
+    """Return the recordings, named by the log and their numbers in it, and that of each row (n,).
+
+    The name of a log ends in its hash, since logs of several recordings often have the same name.
+    """
+    stem = f"{Path(report.source).stem}-{report.log[:DIGITS]}".removesuffix("-")
     if "recording" not in signals.vectors:
         return {stem: report.log}, np.full(len(signals), recording_number(stem))
     numbers, places = np.unique(signals.vectors.pop("recording"), return_inverse=True)
