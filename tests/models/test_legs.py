@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,6 +14,8 @@ from forcegp.forces.noise import EXACT, TORQUE_NOISE
 from forcegp.forces.priors.joint import JointFrictionPrior
 from forcegp.forces.quantities import states
 from forcegp.models.structured_fit import StructuredFit
+from forcegp.robot.free_base import BASE_JOINTS
+from forcegp.storage.system import pack_system, unpack_system
 from robots import example_data
 
 pytest.importorskip("mujoco")
@@ -41,7 +44,7 @@ def fitted() -> StructuredFit:
 def test_a_free_base_has_no_joint_forces() -> None:
     robot = forcegp.load_robot(example_data() / "solo_description/robots/solo12.urdf", base="free")
     assert robot.driven.tolist() == [False] * 6 + [True] * 12
-    assert bool(forcegp.load_robot("kuka_iiwa").driven.all())
+    assert unpack_system(*pack_system(forcegp.ConstrainedSystem(robot)), "here").robot.undriven == BASE_JOINTS
     system = forcegp.ConstrainedSystem(robot)
     q = torch.randn(3, robot.nq, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     at, prior = states(system, q, q, q, torch.ones(3, 0, dtype=torch.bool)), JointFrictionPrior()
@@ -49,6 +52,13 @@ def test_a_free_base_has_no_joint_forces() -> None:
     torch.testing.assert_close(E, torch.diag(robot.driven.double()).expand_as(E))
     B = torch.randn(3, 4, robot.nq, dtype=torch.float64)
     torch.testing.assert_close(prior.applied(B, system, at), B @ E)
+
+
+def test_a_drive_may_have_the_name_of_a_joint_of_the_base(tmp_path: Path) -> None:
+    text = (example_data() / "ur_description/urdf/ur5_robot.urdf").read_text()
+    (tmp_path / "arm.urdf").write_text(text.replace('"shoulder_pan_joint"', '"base_yaw"'))
+    robot = forcegp.load_robot(tmp_path / "arm.urdf")
+    assert robot.joint_names[0] == "base_yaw" and bool(robot.driven.all())
 
 
 @pytest.mark.slow

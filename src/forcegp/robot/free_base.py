@@ -13,12 +13,18 @@ from xml.etree.ElementTree import Element
 import numpy as np
 
 from forcegp.errors import RobotFileError, UnsupportedRobotError
-from forcegp.robot.model import BASE_JOINTS
-from forcegp.robot.tree import Joint, JointKind, Link, Tree
+from forcegp.robot.tree import Base, Joint, JointKind, Link, Tree
 
 KINDS: dict[str, JointKind] = {
-    name: "revolute" if k >= 3 else "prismatic" for k, name in enumerate(BASE_JOINTS)
+    "base_x": "prismatic",
+    "base_y": "prismatic",
+    "base_z": "prismatic",
+    "base_yaw": "revolute",
+    "base_pitch": "revolute",
+    "base_roll": "revolute",
 }
+BASE_JOINTS = tuple(KINDS)
+"""Names of the joints, in order."""
 _AXES = ("1 0 0", "0 1 0", "0 0 1", "0 0 1", "0 1 0", "1 0 0")
 WORLD = "world"
 """Name of the fixed world."""
@@ -60,6 +66,13 @@ def with_free_base(tree: Tree, floating: str | None = None) -> Tree:
     others = (joint for joint in tree.joints if joint not in replaced)
     links = (*links, *(Link(name, frame=False) for name in parents[1:]))
     return replace(tree, links=links, joints=(*joints, *others))
+
+
+def without_drives(tree: Tree, base: Base) -> Tree:
+    """Return the tree in which the joints of a free base have no drive."""
+    own = BASE_JOINTS if base == "free" else ()
+    joints = (replace(joint, driven=joint.driven and joint.name not in own) for joint in tree.joints)
+    return replace(tree, joints=tuple(joints))
 
 
 def free_mjcf(root: Element, label: str) -> None:

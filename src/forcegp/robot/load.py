@@ -26,6 +26,7 @@ from forcegp.errors import (
     UnsupportedRobotError,
     check_name,
 )
+from forcegp.robot.free_base import without_drives
 from forcegp.robot.model import BASE, RobotModel
 from forcegp.robot.safety import parse_xml, read_bytes
 from forcegp.robot.tree import (
@@ -102,6 +103,7 @@ def robot_of(tree: Tree, world: Mapping[str, np.ndarray]) -> RobotModel:
         frame_names=tuple(name for name, _, _ in frames),
         frame_parents=tuple(index for _, index, _ in frames),
         remarks=tuple(remarks),
+        undriven=tuple(joint.name for joint in moving if not joint.driven),
         **{name: torch.tensor(np.asarray(x, dtype=np.float64)) for name, x in values.items()},
     )
 
@@ -434,11 +436,11 @@ def read_tree(data: bytes, path: Path, base: Base = "fixed") -> Tree:
     """Return the links and joints in the content of a file; raise `RobotFileError` if it is invalid."""
     root = parse_xml(data, str(path))
     if root.tag == "robot":
-        return read_urdf(root, str(path), base)
+        return without_drives(read_urdf(root, str(path), base), base)
     if root.tag == "mujoco":
         from forcegp.robot.mjcf import read_mjcf  # loads MuJoCo, which is optional
 
-        return read_mjcf(root, path, base)
+        return without_drives(read_mjcf(root, path, base), base)
     expected = "a <robot> or a <mujoco> document"
     raise RobotFileError(f"{path}: neither URDF nor MJCF", expected=expected, got=f"<{root.tag[:60]}>")
 

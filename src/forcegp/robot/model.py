@@ -21,8 +21,6 @@ from forcegp.errors import ParameterError, ShapeError, UnsupportedRobotError, ch
 from forcegp.notebook import html_table
 
 JointType = Literal["revolute", "prismatic"]
-BASE_JOINTS = ("base_x", "base_y", "base_z", "base_yaw", "base_pitch", "base_roll")
-"""Names of the joints of a free base, in order (`free_base.py`)."""
 BASE = -1
 """Joint index that denotes the fixed base."""
 
@@ -58,6 +56,7 @@ class RobotModel:
         remarks: notes on questionable properties of the file, one sentence each.
         coupling: matrix C `(nq, nq)` for drives that move with several joints, at the speeds C q̇; `None` if
             each joint has its own drive. Damping, friction and armature are those of the drives.
+        undriven: names of joints without a drive, which are those of a free base.
         torque_scale: torque of each drive over its nominal one, `(nq,)`; `None` if torques are measured.
         drag: quadratic and cubic damping, `(nq, 2)` [N m s²/rad², N m s³/rad³; N s²/m², N s³/m³]; `None` for
             linear damping.
@@ -96,6 +95,7 @@ class RobotModel:
     remarks: tuple[str, ...] = ()
     coupling: Tensor | None = None
     torque_scale: Tensor | None = None
+    undriven: tuple[str, ...] = ()
     drag: Tensor | None = None
     bristle: Tensor | None = None
 
@@ -157,7 +157,7 @@ class RobotModel:
     @cached_property
     def driven(self) -> Tensor:
         """Mask `(nq,)` of the joints with a drive, which those of a free base do not have."""
-        flags = [joint not in BASE_JOINTS for joint in self.joint_names]
+        flags = [joint not in self.undriven for joint in self.joint_names]
         return torch.tensor(flags, device=self.device)
 
     @cached_property

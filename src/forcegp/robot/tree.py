@@ -91,6 +91,7 @@ class Joint:
         refused: the reason why the joint must be locked, or an empty string.
         follows: the position that this joint has if it mimics another joint.
         locked: position at which the joint was locked [rad, m].
+        driven: whether the joint has a drive, which those of a free base do not have.
     """
 
     name: str
@@ -113,6 +114,7 @@ class Joint:
     refused: str = ""
     follows: Coupling | None = None
     locked: float | None = None
+    driven: bool = True
 
 
 @dataclass(frozen=True)

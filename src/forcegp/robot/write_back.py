@@ -23,9 +23,10 @@ from torch import Tensor
 from forcegp.errors import RobotFileError
 from forcegp.files import atomic_file
 from forcegp.robot.edit_xml import EditableXml, Span
+from forcegp.robot.free_base import BASE_JOINTS
 from forcegp.robot.inertia import from_pseudo_inertia, pseudo_inertia
 from forcegp.robot.load import read_tree, robot_of, robot_path
-from forcegp.robot.model import BASE_JOINTS, RobotModel
+from forcegp.robot.model import RobotModel
 from forcegp.robot.safety import parse_xml, read_bytes
 from forcegp.robot.tree import (
     Base,

@@ -51,6 +51,7 @@ class RobotRecord(Record):
     frame_names: tuple[str, ...]
     frame_parents: tuple[int, ...]
     remarks: tuple[str, ...]
+    undriven: tuple[str, ...] = ()
 
 
 class ContactFields(Record):
