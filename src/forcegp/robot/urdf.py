@@ -146,6 +146,7 @@ def _joint(element: Element, label: str) -> Joint:
         damping=damping,
         friction=friction,
         drag=(0.0, 0.0),
+        driven=True,
         **_limits(limit, kind, where),
         refused=f"mimics joint {mimic['joint']!r}" if mimic else "",
         follows=_coupling(mimic) if mimic else None,
