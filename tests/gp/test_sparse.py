@@ -180,7 +180,8 @@ def test_large_scales_lose_no_digits() -> None:
     own = by_rows(posterior, test)
     mean = (own @ np.linalg.solve(R, Q.T @ target)).reshape(9, 3)
     half = np.linalg.solve(R.T, own.T).T.reshape(9, 3, -1)
-    _, _, missed = posterior.basis.evaluate(test.features)
+    parts = zip(posterior.basis.parts, test.features, strict=True)
+    missed = torch.cat([part.missed(part.rest_variance(x), part.values(x)[1]) for part, x in parts]).mT
     W = torch.cat(test.operators, dim=-1).numpy()
     covariance = half @ half.transpose(0, 2, 1) + np.einsum("nak,nk,nbk->nab", W, missed.numpy(), W)
     assert posterior.jitter == 0.0
@@ -190,10 +191,32 @@ def test_large_scales_lose_no_digits() -> None:
 
 def by_rows(posterior: SparsePosterior, block: Block) -> np.ndarray:
     """W_i V_iᵀ of all rows, a component at a time."""
-    V, _, _ = posterior.basis.evaluate(block.features)
-    W = torch.cat(block.operators, dim=-1)
-    parts = [W[:, :, k, None] * V[:, None, own] for k, own in enumerate(posterior.basis.columns)]
-    return torch.cat(parts, dim=-1).flatten(0, 1).numpy()
+    rows = []
+    for part, W, x in zip(posterior.basis.parts, block.operators, block.features, strict=True):
+        for k, V in enumerate(part.values(x)[0]):
+            rows.append(W[:, :, k, None] * V[:, None, part.used[k]])
+    return torch.cat(rows, dim=-1).flatten(0, 1).numpy()
+
+
+def test_processes_with_one_operator_are_summed_together() -> None:
+    """Against all rows, where two processes share an operator, one of them is padded, and blocks alternate."""
+    few = Named(Linear(("q",)), "few")
+    processes, one = (PROCESSES[0], few, PROCESSES[0]), rows(40)
+    params = parameters() | {f"few.{k}": v for k, v in few.kernel.initial(2, {"q": 2, "qd": 2}).items()}
+    W, other = one.operators
+    x, y = one.features
+    shared = Block((x, y, y), (W, W, other.expand(-1, -1, 2)), one.target)
+    apart = Block((x, y, y), (W, 2.0 * W, torch.zeros_like(W)), one.target)
+    for key in (key for key in params if "lengthscale" in key):
+        params[key][..., -1, :] += 9.0
+    basis = latent_basis(processes, params, first(shared, 12), (2, 2, 2))
+    blocks = [shared, apart, shared]
+    Phi = np.concatenate([basis.rows(block).numpy() for block in blocks])
+    sums = accumulate(basis, blocks, chunk=16)
+    target = torch.cat([block.target.flatten() for block in blocks]).numpy()
+    assert not all(bool(part.used.all()) for part in basis.parts)
+    assert np.abs(sums.G.numpy() - Phi.T @ Phi).max() < ROUNDING * np.abs(Phi.T @ Phi).max()
+    assert np.abs(sums.v.numpy() - Phi.T @ target).max() < ROUNDING * np.abs(Phi.T @ target).max()
 
 
 def test_sums_of_different_bases_do_not_add() -> None:

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -55,9 +55,7 @@ class WhitenedRows:
             return self
         # Noise Σ/κ: √κ W, √κ y
         root = math.sqrt(power)
-        blocks = [
-            Block(b.features, tuple(root * W for W in b.operators), root * b.target) for b in self.blocks
-        ]
+        blocks = [block.mapped(lambda rows: root * rows) for block in self.blocks]
         return WhitenedRows(blocks, lambda: power * self.constant)
 
 
@@ -124,20 +122,26 @@ def _by_rank(rank: Tensor) -> list[tuple[int, Tensor | slice]]:
 
 @dataclass(frozen=True)
 class _Rows:
-    """Samples with the same number of rows: kernel inputs of each prior, number of columns of each operator,
-    and concatenated operators, residual, and noise factor N `(n, r, ·)` for noise of covariance I + N Nᵀ.
+    """Samples with the same number of rows.
+
+    Attributes:
+        features: kernel inputs of each prior.
+        places: place of the operator of each prior among the different operators.
+        widths: number of columns of each of these.
+        rows: operators, residual, and noise factor N for noise of covariance I + N Nᵀ `(n, r, ·)`.
     """
 
     features: tuple[Features, ...]
+    places: tuple[int, ...]
     widths: tuple[int, ...]
     rows: Tensor
 
     def of(self, index: Tensor | slice, U: Tensor) -> _Rows:
         """Multiply Uᵀ by the rows of the given samples (of all samples if `index` is a slice)."""
         if isinstance(index, slice):
-            return _Rows(self.features, self.widths, U.mT @ self.rows)
+            return replace(self, rows=U.mT @ self.rows)
         features = tuple({name: x[index] for name, x in f.items()} for f in self.features)
-        return _Rows(features, self.widths, U.mT @ self.rows[index])
+        return replace(self, features=features, rows=U.mT @ self.rows[index])
 
     def whitened(self, weight: Tensor | None) -> tuple[Block, Tensor]:
         """Divide the rows by the factor of I + N Nᵀ, and return them with the log determinant of the factors.
@@ -159,7 +163,8 @@ class _Rows:
             # Noise Σ/w: √w (W, y)
             rows = weight.sqrt()[:, None, None] * rows
         *operators, residual = rows.split([*self.widths, 1], dim=-1)
-        return Block(self.features, tuple(operators), residual[..., 0]), log_determinant
+        each = tuple(operators[place] for place in self.places)
+        return Block(self.features, each, residual[..., 0]), log_determinant
 
 
 def whiten(
@@ -172,14 +177,27 @@ def whiten(
     # W = B E and E[z] = o + B m (eqs. 12 and 15)
     rows = process.rows(system, at, z)
     # (W, y − E[z], N)/σ
-    parts = [*rows.operators, (measurement.values - rows.target)[..., None], *noise.factors(at, z)]
-    widths = tuple(W.shape[-1] for W in rows.operators)
-    everything = _Rows(rows.features, widths, torch.cat(parts, dim=-1) / std[..., None])
+    operators, places = _different(rows.operators)
+    parts = [*operators, (measurement.values - rows.target)[..., None], *noise.factors(at, z)]
+    widths = tuple(W.shape[-1] for W in operators)
+    everything = _Rows(rows.features, places, widths, torch.cat(parts, dim=-1) / std[..., None])
     # State noise also affects the directions fixed by the constraint, so these are not projected out.
     if measurement.quantity == "qdd" and system.m > 0 and noise.state is None:
         return _without_fixed(everything, at.eom, measurement.values, std, noise.weight)
     block, log_determinant = everything.whitened(noise.weight)
     return WhitenedRows([block], lambda: log_determinant + _log_scale(std, noise.weight))
+
+
+def _different(operators: Sequence[Tensor]) -> tuple[list[Tensor], tuple[int, ...]]:
+    """Return the operators that differ, and the place of each operator among them."""
+    different: list[Tensor] = []
+    places: list[int] = []
+    for W in operators:
+        equal = (k for k, other in enumerate(different) if other is W or torch.equal(other, W))
+        places.append(next(equal, len(different)))
+        if places[-1] == len(different):
+            different.append(W)
+    return different, tuple(places)
 
 
 def _without_fixed(

@@ -212,13 +212,6 @@ class ProcessBasis:
             return lambda x: next(iter(x.values())).new_zeros(self.components, points(x))
         return rest.kernel.variance(rest.params)
 
-    def evaluate(self, features: Features) -> tuple[Tensor, Tensor, Tensor]:
-        """Evaluate this process as `LatentBasis.evaluate` does for all processes, with V `(n, Σ sizes)`."""
-        values, explained = self.values(features)
-        V = values.transpose(0, 1).reshape(points(features), -1).index_select(1, self.columns)
-        prior = self.rest_variance(features)
-        return V, prior.mT, self.missed(prior, explained).mT
-
 
 @dataclass(frozen=True, eq=False)
 class LatentBasis:
@@ -300,20 +293,6 @@ class LatentBasis:
         """Express the rows of a block in terms of the basis functions, Φ `(n r, size)`."""
         each = zip(self.parts, block.operators, block.features, strict=True)
         return torch.cat([part.rows(W, part.values(x)[0]) for part, W, x in each], dim=-1)
-
-    def evaluate(self, features: Sequence[Features]) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the basis functions at n samples.
-
-        Args:
-            features: kernel inputs of each process.
-
-        Returns:
-            V `(n, size)`, and the prior variance and residual variance k(x, x) − |V(x)|² of the rest of the
-            kernel, each `(n, components)`.
-        """
-        parts = [part.evaluate(x) for part, x in zip(self.parts, features, strict=True)]
-        V, prior, missed = (torch.cat(columns, dim=-1) for columns in zip(*parts, strict=True))
-        return V, prior, missed
 
 
 def latent_basis(

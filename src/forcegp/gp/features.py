@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -103,7 +103,7 @@ class Block:
 
     Attributes:
         features: standardized kernel inputs `(n, w)` for each prior, keyed by name.
-        operators: operator W `(n, r, components)` for each prior.
+        operators: operator W `(n, r, components)` for each prior; one tensor if those of several are equal.
         target: whitened residual `(n, r)`.
     """
 
@@ -115,6 +115,11 @@ class Block:
     def rows(self) -> int:
         """Number of rows, n r."""
         return self.target.numel()
+
+    def mapped(self, change: Callable[[Tensor], Tensor]) -> Block:
+        """Return the block with changed operators and targets. Equal operators remain the same tensor."""
+        changed = {id(W): change(W) for W in self.operators}
+        return Block(self.features, tuple(changed[id(W)] for W in self.operators), change(self.target))
 
 
 def points(features: Features) -> int:
@@ -136,11 +141,8 @@ def chunked(blocks: Iterable[Block], samples: int) -> Iterator[Block]:
 
 def rows_of(block: Block, index: slice | Tensor) -> Block:
     """Return the given samples of a block."""
-    return Block(
-        tuple({name: x[index] for name, x in f.items()} for f in block.features),
-        tuple(W[index] for W in block.operators),
-        block.target[index],
-    )
+    features = tuple({name: x[index] for name, x in f.items()} for f in block.features)
+    return replace(block.mapped(lambda rows: rows[index]), features=features)
 
 
 def rows_mean(latent_mean: Callable[[int, Features], Tensor], block: Block) -> Tensor:

@@ -6,6 +6,7 @@ and v = Σ V_i c_i, where V_i contains the basis functions of each component at 
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields, replace
 
@@ -148,75 +149,136 @@ def accumulate(basis: LatentBasis, blocks: Iterable[Block], chunk: int = CHUNK_S
         blocks: whitened rows, possibly from a generator.
         chunk: number of samples per chunk.
     """
-    total: Sums | None = None
+    total, part = Sums.zero(basis, next(iter(basis.params.values()))), None
     for block in chunked(blocks, chunk):
-        total = Sums.zero(basis, block.target) if total is None else total
-        _add(basis, block, total)
-    if total is None:
-        return Sums.zero(basis, next(iter(basis.params.values())))
-    # G = Gᵀ, from its upper triangle
-    total.G.copy_(torch.triu(total.G) + torch.triu(total.G, 1).mT)
+        groups = _groups(basis, block)
+        if part is None or part.groups != groups:
+            if part is not None:
+                part.add_to(total)
+            part = _Arranged.zero(basis, groups, total.v)
+        part.add(basis, block, total)
+    if part is not None:
+        part.add_to(total)
     return total
 
 
-def _add(basis: LatentBasis, block: Block, into: Sums) -> None:
-    """Add a block in place. Only the upper triangle of G is updated.
+@dataclass(frozen=True)
+class _Group:
+    """Processes with the same operator. They act like one process with all their basis functions.
 
-    The rows Φ of components with few columns are computed for all of them together.
+    Attributes:
+        processes: the processes.
+        components: number of components.
+        width: number of columns of each component, including padding.
     """
-    V, prior, missed = basis.evaluate(block.features)
-    W, y = torch.cat(block.operators, dim=-1), block.target
-    # S_kk of S = WᵀW `(n, k)`
-    S_kk = W.square().sum(1)
-    sizes = [at.stop - at.start if bool(S_kk[:, k].any()) else 0 for k, at in enumerate(basis.columns)]
-    wide, narrow = (
-        [k for k, n in enumerate(sizes) if n > FEW],
-        [k for k, n in enumerate(sizes) if 0 < n <= FEW],
-    )
-    _add_wide(basis, V, W[..., wide], wide, y, into)
-    if narrow:
-        at = torch.cat([_range(basis.columns[k]) for k in narrow]).to(V.device)
-        owner = torch.tensor(narrow).repeat_interleave(torch.tensor([sizes[k] for k in narrow])).to(V.device)
-        # Φ = W V, G_NN += ΦᵀΦ, v_N += Φᵀy, and G_kN += Σ_i V_kᵀ (W_kᵀ Φ) for all other components k
-        Phi = W.index_select(-1, owner) * V.index_select(1, at)[:, None]
-        rows = Phi.flatten(0, 1)
-        into.G[at[:, None], at] += rows.mT @ rows
-        into.v[at] += rows.mT @ y.flatten()
-        across = (W[..., wide].mT @ Phi).transpose(0, 1).contiguous()
-        for k, of_all in zip(wide, across, strict=True):
-            own = _range(basis.columns[k]).to(V.device)
-            both, later = V[:, basis.columns[k]].mT @ of_all, at > own[0]
-            into.G[own[:, None], at[later]] += both[:, later]
-            into.G[at[~later][:, None], own] += both[:, ~later].mT
-    # tr W k Wᵀ = Σ_k S_kk k_k(x, x), and of what is missed, k − |V|²
-    into.prior.add_(_by_process(basis, S_kk, prior))
-    into.missed.add_(_by_process(basis, S_kk, missed))
-    into.yy.add_((y**2).sum())
-    into.rows.add_(block.rows)
+
+    processes: tuple[int, ...]
+    components: int
+    width: int
 
 
-def _range(columns: slice) -> Tensor:
-    return torch.arange(columns.start, columns.stop)
+def _groups(basis: LatentBasis, block: Block) -> tuple[_Group, ...]:
+    """Return the processes that act on a block, grouped by operator. Groups with few columns are the last."""
+    same: dict[int, list[int]] = {}
+    for p, W in enumerate(block.operators):
+        same.setdefault(id(W), []).append(p)
+    groups = []
+    for own in same.values():
+        if bool(block.operators[own[0]].any()):
+            width = sum(basis.parts[p].used.shape[1] for p in own)
+            groups.append(_Group(tuple(own), basis.parts[own[0]].components, width))
+    return tuple(sorted(groups, key=lambda group: group.width <= FEW))
 
 
-def _add_wide(basis: LatentBasis, V: Tensor, W: Tensor, wide: list[int], y: Tensor, into: Sums) -> None:
-    """Add the components with several columns, whose rows W V would need too much memory."""
-    # S = WᵀW `(k, k, n)` and c = Wᵀy `(n, k)` of each sample
-    S, c = (W.mT @ W).permute(1, 2, 0).contiguous(), (W.mT @ y[..., None])[..., 0]
-    weighted, columns = torch.empty_like(V), [basis.columns[k] for k in wide]
-    for k, of_k in enumerate(columns):
-        # G_kl += Σ_i V_k S_kl V_lᵀ, v_k += Σ_i V_k c_k
-        for l, of_l in enumerate(columns[k:], k):
-            torch.mul(V[:, of_l], S[k, l, :, None], out=weighted[:, of_l])
-        for run in _runs(columns[k:]):
-            into.G[of_k, run].addmm_(V[:, of_k].mT, weighted[:, run])
-        into.v[of_k] += V[:, of_k].mT @ c[:, k]
+@dataclass(frozen=True, eq=False)
+class _Arranged:
+    """The sums G and v over samples that have the same groups, with columns in the order of the groups.
+
+    Attributes:
+        groups: the groups.
+        positions: position of each column in the basis, or −1 for padding.
+        G: Σ V S Vᵀ, of which only the upper triangle is used.
+        v: Σ V c.
+    """
+
+    groups: tuple[_Group, ...]
+    positions: Tensor
+    G: Tensor
+    v: Tensor
+
+    @classmethod
+    def zero(cls, basis: LatentBasis, groups: tuple[_Group, ...], like: Tensor) -> _Arranged:
+        """Return the sums over no samples."""
+        each = [torch.arange(0)]
+        for group in groups:
+            own = [torch.full(basis.parts[p].used.shape, -1) for p in group.processes]
+            for at, p in zip(own, group.processes, strict=True):
+                columns = basis.of_process(p)
+                at[basis.parts[p].used] = torch.arange(columns.start, columns.stop)
+            each.append(torch.cat(own, dim=1).flatten())
+        at = torch.cat(each).to(like.device)
+        return cls(groups, at, like.new_zeros(len(at), len(at)), like.new_zeros(len(at)))
+
+    def add(self, basis: LatentBasis, block: Block, moments: Moments) -> None:
+        """Add a block in place, and its other sums to the moments."""
+        y, W = block.target, [block.operators[group.processes[0]] for group in self.groups]
+        V = [_values(basis, block, group, moments) for group in self.groups]
+        wide = sum(group.width > FEW for group in self.groups)
+        W_wide = torch.cat([y.new_zeros(*y.shape, 0), *W[:wide]], dim=-1)
+        V_wide = torch.cat([y.new_zeros(len(y), 0), *(x.flatten(1) for x in V[:wide])], dim=-1)
+        # S = WᵀW `(k, k, n)` and c = Wᵀy `(k, n)` of each sample
+        S, c = (W_wide.mT @ W_wide).permute(1, 2, 0).contiguous(), (W_wide.mT @ y[..., None])[..., 0].mT
+        # The other rows Φ = W V are computed, and Wᵀ Φ
+        Phi = [
+            (W_g[..., None] * V_g[:, None]).flatten(2) for W_g, V_g in zip(W[wide:], V[wide:], strict=True)
+        ]
+        rows = torch.cat([y.new_zeros(*y.shape, 0), *Phi], dim=-1)
+        across, rows = W_wide.mT @ rows, rows.flatten(0, 1)
+        few, columns = slice(V_wide.shape[1], None), self._columns(wide)
+        weighted = torch.empty_like(V_wide)
+        for k, of_k in enumerate(columns):
+            # G_kl += Σ_i V_k S_kl V_lᵀ, v_k += Σ_i V_k c_k
+            for l, of_l in enumerate(columns[k:], k):
+                torch.mul(V_wide[:, of_l], S[k, l, :, None], out=weighted[:, of_l])
+            V_k, later = V_wide[:, of_k].mT, slice(of_k.start, few.start)
+            self.G[of_k, later].addmm_(V_k, weighted[:, later])
+            self.G[of_k, few].addmm_(V_k, across[:, k])
+            self.v[of_k] += V_k @ c[k]
+        self.G[few, few].addmm_(rows.mT, rows)
+        self.v[few] += rows.mT @ y.flatten()
+        moments.yy.add_(y.square().sum())
+        moments.rows.add_(block.rows)
+
+    def _columns(self, wide: int) -> list[slice]:
+        """Return the columns of each component of the first groups."""
+        widths = [group.width for group in self.groups[:wide] for _ in range(group.components)]
+        ends = list(itertools.accumulate(widths, initial=0))
+        return [slice(a, b) for a, b in itertools.pairwise(ends)]
+
+    def add_to(self, total: Sums) -> None:
+        """Add the sums to those of the basis, in its order and without padding."""
+        used = (self.positions >= 0).nonzero()[:, 0]
+        at, G = self.positions[used], torch.triu(self.G)[used[:, None], used]
+        total.G[at[:, None], at] += G + torch.triu(G, 1).mT
+        total.v[at] += self.v[used]
 
 
-def _by_process(basis: LatentBasis, S_kk: Tensor, variance: Tensor) -> Tensor:
-    """Return Σ S_kk var_k for each process `(processes,)`, given S_kk and the variances `(n, k)`."""
-    traces = (S_kk * variance).sum(0)
-    return torch.stack([traces[components].sum() for components in basis.components])
+def _values(basis: LatentBasis, block: Block, group: _Group, moments: Moments) -> Tensor:
+    """Return the basis functions of a group `(n, components, width)`, with zeros as padding.
+
+    The variances of the parts that inducing points approximate are added to the moments.
+    """
+    S_kk, each = block.operators[group.processes[0]].square().sum(1).mT, []
+    for p in group.processes:
+        part, x = basis.parts[p], block.features[p]
+        values, explained = part.values(x)
+        each.append(values.transpose(0, 1))
+        if part.split.rest is not None:
+            # tr W k Wᵀ = Σ_k S_kk k_k(x, x) with S = WᵀW, and of what is missed, k − |V|²
+            prior = part.rest_variance(x)
+            moments.prior[p] += (S_kk * prior).sum()
+            moments.missed[p] += (S_kk * part.missed(prior, explained)).sum()
+    return torch.cat(each, dim=-1)
 
 
 @torch.no_grad()
@@ -247,14 +309,3 @@ def add_rows(basis: LatentBasis, moments: Moments, blocks: Sequence[Block]) -> t
     prior, missed = torch.stack(traces, dim=1)
     yy, rows = moments.yy + y @ y, moments.rows + len(y)
     return Moments(v, yy, rows, moments.prior + prior, moments.missed + missed), Phi
-
-
-def _runs(columns: list[slice]) -> list[slice]:
-    """Merge adjacent slices."""
-    runs: list[slice] = []
-    for part in columns:
-        if runs and runs[-1].stop == part.start:
-            runs[-1] = slice(runs[-1].start, part.stop)
-        else:
-            runs.append(part)
-    return runs
