@@ -199,7 +199,7 @@ def by_rows(posterior: SparsePosterior, block: Block) -> np.ndarray:
 
 
 def test_processes_with_one_operator_are_summed_together() -> None:
-    """Against all rows, where two processes share an operator, one of them is padded, and blocks alternate."""
+    """Against all rows, where two processes share an operator, one is padded, and blocks alternate."""
     few = Named(Linear(("q",)), "few")
     processes, one = (PROCESSES[0], few, PROCESSES[0]), rows(40)
     params = parameters() | {f"few.{k}": v for k, v in few.kernel.initial(2, {"q": 2, "qd": 2}).items()}
