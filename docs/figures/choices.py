@@ -1,6 +1,6 @@
-"""Draw the plots of the pages on choices: models, priors, inference and stabilization, on the paper's task.
+"""Draw the plots of the pages on choices: models, priors and stabilization, on the paper's task.
 
-    python docs/figures/choices.py [model] [prior] [inference] [stabilization]
+    python docs/figures/choices.py [model] [prior] [stabilization]
 
 A KUKA iiwa slides over a table in simulation. All fits learn from one motion and are tested on another one.
 """
@@ -8,7 +8,6 @@ A KUKA iiwa slides over a table in simulation. All fits learn from one motion an
 from __future__ import annotations
 
 import sys
-import time
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -93,23 +92,6 @@ def prior() -> None:
     draw_errors(errors(models, train, test), nominal(test), "prior")
 
 
-def inference() -> None:
-    data = simulate(system(), SimulationConfig(duration=60.0, seed=0)).data
-    _, axis = plt.subplots()
-    for kind, sizes in (("exact", (50, 100, 200, 400, 800, 1600)), ("sparse", (50, 200, 800, 3200, 12800))):
-        seconds = []
-        for count in sizes:
-            part = data[:: len(data) // count][:count]
-            one = forcegp.StructuredGP(system(), "analytical", [forcegp.JointForcePrior()], inference=kind)
-            began = time.perf_counter()
-            one.fit(part, learn=[])
-            seconds.append(time.perf_counter() - began)
-            print(f"{kind}, {count} samples: {seconds[-1]:.2f} s", flush=True)
-        axis.loglog(sizes, seconds, "o-", ms=4, label=kind)
-    axis.set(xlabel="samples", ylabel="time of conditioning [s]")
-    finished(axis, "inference")
-
-
 def stabilization() -> None:
     from forcegp import RolloutOptions
 
@@ -133,5 +115,5 @@ if __name__ == "__main__":
     plt.rcParams.update({"figure.figsize": (5.2, 3.0), "font.size": 9, "svg.hashsalt": "forcegp"})
     plt.rcParams.update({"axes.spines.top": False, "axes.spines.right": False, "legend.frameon": False})
     plt.rcParams.update({"axes.grid": True, "grid.alpha": 0.3, "savefig.bbox": "tight"})
-    for name in sys.argv[1:] or ("model", "prior", "inference", "stabilization"):
+    for name in sys.argv[1:] or ("model", "prior", "stabilization"):
         globals()[name]()
