@@ -31,7 +31,7 @@ EXECUTED = "{code-cell} python"
 DIRECTIVES = ("{toctree}", "{include}", "{eval-rst}")
 INSTALLED = tuple(f"$ {command}" for command in ("pip install", "make ", "python benchmarks/", "python -W"))
 """Commands that cannot run while the site is built: they install, take hours, or need several machines."""
-WORDS = {"the site": 20_000, "README.md": 700}
+WORDS = {"the site": 16_000, "README.md": 700}
 """Words that a reader sees: prose, tables and code, without API reference and messages."""
 UNSEEN = re.compile(r"remove-cell|remove-input|^```\{toctree\}")
 """Blocks that the built page does not show."""
