@@ -7,7 +7,7 @@ PROFILE ?= quick
 RESOLUTION ?= lowest-direct
 
 .DEFAULT_GOAL := help
-.PHONY: help setup reproduce test test-slow lint types package docs benchmark clean attack audit ends
+.PHONY: help setup reproduce test test-slow lint types package docs benchmark evidence clean attack audit ends
 
 help:            ## list the targets
 	@grep -hE '^[a-z-]+: .*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 14
@@ -59,6 +59,9 @@ benchmark: $(READY)  ## every benchmark, results as JSON under out/benchmarks
 	  echo "[benchmark] $$name"; $(BIN)/python benchmarks/$$name.py --json $(OUT)/benchmarks/$$name.json || exit 1; \
 	done
 	@echo "[benchmark] results are in $(OUT)/benchmarks"
+
+evidence: $(READY) ## the benchmarks of docs/evidence.md, and its tables (hours)
+	OMP_NUM_THREADS=1 PYTHONPATH=. $(BIN)/python benchmarks/evidence.py --folder $(OUT)/evidence
 
 audit: $(READY)  ## known vulnerabilities of the installed packages, where the advisory service answers
 	@$(BIN)/python -m pip install --quiet -c constraints.txt pip-audit || echo "[audit] pip-audit cannot be installed"

@@ -13,6 +13,7 @@ import sys
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
+from types import ModuleType
 
 import forcegp
 
@@ -40,8 +41,6 @@ SPEAKING = re.compile(rf"\b({SUBJECTS})( \w+)? (shows?|knows?|tells?|says?|asks?
 """Data and forces that speak, know or see."""
 QUESTION = re.compile(r"(What|Where|How|Why|Which|Who)\b")
 DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
-MODULES = {"compiled", "derivatives", "dynamics", "identification", "kinematics"}
-"""Public names that are modules."""
 
 
 @cache
@@ -92,9 +91,11 @@ def links_lead_to_files() -> Iterator[str]:
 def public_names_are_in_the_reference() -> Iterator[str]:
     """Yield public names without an entry in the reference."""
     reference = "".join(text(page) for page in (DOCS / "reference").glob("*.md"))
-    for name in forcegp.__all__:
-        directive = "automodule" if name in MODULES else "auto(?:class|function)"
-        if not re.search(rf"^\.\. {directive}:: forcegp\.{name}$", reference, flags=re.M):
+    names = {name: getattr(forcegp, name) for name in forcegp.__all__}
+    for name in [*names, *(f"priors.{name}" for name in forcegp.priors.__all__)]:
+        module = isinstance(names.get(name), ModuleType)
+        directive, end = (r"auto\w+", r"\b") if module else ("auto(?:class|function)", "$")
+        if not re.search(rf"^\.\. {directive}:: forcegp\.{name}{end}", reference, flags=re.M):
             yield f"docs/reference: no entry for forcegp.{name}"
 
 

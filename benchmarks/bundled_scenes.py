@@ -13,9 +13,10 @@ from __future__ import annotations
 import argparse
 import dataclasses
 
-from forcegp import ConstrainedSystem, Dataset, LearningOptions, StructuredGP
+from forcegp import ConstrainedSystem, Dataset, StructuredGP
 from forcegp.data import split_by_stretches
 from forcegp.evaluation import Evaluation, evaluate
+from forcegp.models import LearningOptions
 from forcegp.models.analytical import AnalyticalModel
 from forcegp.models.registry import create
 from forcegp.scene import BUNDLED, load_scene

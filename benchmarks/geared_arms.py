@@ -170,7 +170,7 @@ def wiped(name: str, seed: int) -> tuple[forcegp.ConstrainedSystem, forcegp.Data
     plane = forcegp.Plane(normal=(0.0, 0.0, 1.0), offset=centre[2])
     frame = [each for each, parent in pairs if parent == last][-1]
     tip = forcegp.SurfaceContact(name="table", frame=frame, point=point, surface=plane)
-    system = forcegp.ConstrainedSystem(robot, [tip], baumgarte=forcegp.Baumgarte(10.0, 1.0))
+    system = forcegp.ConstrainedSystem(robot, [tip], baumgarte=forcegp.constraints.Baumgarte(10.0, 1.0))
     drives, dry = (np.array(x) * random.uniform(0.5, 1.5, robot.nq) for x in (drives, dry))
     true = robot.replace(
         mass=HEAVIER * robot.mass,

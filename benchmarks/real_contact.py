@@ -267,8 +267,10 @@ def learned(
         closed = data[data.contact["ground"]]
         force = {"F_I": {"ground": closed.contact_extras[SENSOR]["ground"]}}
         noise = torch.tensor([UNKNOWN, UNKNOWN, std], dtype=torch.float64)
-        sensed = forcegp.Observation(closed.replace(contact_extras=force), "contact_force", noise_std=noise)
-        return model.fit([forcegp.Observation(data), sensed])
+        sensed = forcegp.priors.Observation(
+            closed.replace(contact_extras=force), "contact_force", noise_std=noise
+        )
+        return model.fit([forcegp.priors.Observation(data), sensed])
     return model.fit(data)
 
 
@@ -498,7 +500,7 @@ def hop(logs: Path) -> dict[str, object]:
     result: dict[str, object] = {"measured": jump(log.q[:, 0], lifted, landed - left)}
     for name in ("", "sensor"):
         fit = learned(system, between(data, FIRST), name, sensor_std(logs, "hopping", FIRST, window))
-        options = forcegp.RolloutOptions(unilateral=True, on_divergence="keep")
+        options = forcegp.rollout.RolloutOptions(unilateral=True, on_divergence="keep")
         path = fit.rollout(
             log.q[0], log.qd[0], log, DT * (len(log) - 1), SAMPLES, system=system, options=options
         )

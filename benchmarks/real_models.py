@@ -90,7 +90,7 @@ def structured(case: Case, samples: int | None = None, priors: Sequence[ForcePri
 def independent_gp(case: Case) -> Fitted:
     """One Gaussian process per joint acceleration."""
     train = evenly(moving(case.train), GP_SAMPLES)
-    fit = forcegp.IndependentGP(case.system).fit(train)
+    fit = forcegp.models.IndependentGP(case.system).fit(train)
     noise = fit.training.noise_std.expand_as(train.qdd).square().mean(0).sqrt()
 
     def predict(data: forcegp.Dataset) -> Predicted:
@@ -106,7 +106,7 @@ def network(case: Case) -> Fitted:
     """A network of one hidden layer."""
     train = evenly(moving(case.train), NETWORK_SAMPLES)
     options = BatchOptions(epochs=NETWORK_EPOCHS)
-    fit = forcegp.NeuralNetwork(case.system).fit(train, options=options)
+    fit = forcegp.models.NeuralNetwork(case.system).fit(train, options=options)
 
     def predict(data: forcegp.Dataset) -> Predicted:
         return Predicted(fit.predict(data.q, data.qd, data.tau).mean, None, case.system)

@@ -72,8 +72,8 @@ def friction(samples: int, seed: int, joint_friction: bool) -> Tensor:
     system = forcegp.ConstrainedSystem(forcegp.load_robot("kuka_iiwa"), [table])
     name, dry = table.name, JOINT_FRICTION * joint_friction
     train, test = pressed(system, samples, 2 * seed, dry), pressed(system, TESTS, 2 * seed + 1, dry)
-    priors = [forcegp.JointFrictionPrior()] if joint_friction else []
-    priors.append(forcegp.SlidingFrictionPrior(name, Linear(), coupled=True))
+    priors = [forcegp.priors.JointFrictionPrior()] if joint_friction else []
+    priors.append(forcegp.priors.SlidingFrictionPrior(name, Linear(), coupled=True))
     fit = forcegp.StructuredGP(
         system, "analytical", priors, noise=forcegp.Noise(acceleration=0.01, torque=None)
     ).fit(train)
@@ -96,7 +96,7 @@ def joints(samples: int, seed: int) -> Tensor:
     noisy = qdd + 0.1 * torch.randn(n, 2, dtype=torch.float64, generator=generator)
     t = torch.arange(n, dtype=torch.float64)
     data = forcegp.Dataset(t, q, qd, tau, noisy, system.robot.joint_names)
-    prior = forcegp.JointForcePrior(SquaredExponential(("q", "qd")))
+    prior = forcegp.priors.JointForcePrior(SquaredExponential(("q", "qd")))
     fit = forcegp.StructuredGP(system, "analytical", [prior], noise=0.1).fit(data[:samples])
     test = data[samples:]
     found = fit.predict(test.q, test.qd, test.tau, "joint_force")

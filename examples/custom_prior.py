@@ -33,7 +33,7 @@ data = forcegp.Dataset(t=t[:, 0], q=q, qd=qd, tau=tau, qdd=qdd, joint_names=robo
 train = data[::40]
 
 # %% The prior: three components, which act through the Jacobian of the tip and depend on its position
-pull = forcegp.OperatorForcePrior(
+pull = forcegp.priors.OperatorForcePrior(
     "hose",
     size=3,
     operator_function=lambda system, at: kinematics.point_jacobian(system.robot, at.q, *TIP).mT,
@@ -44,7 +44,7 @@ pull = forcegp.OperatorForcePrior(
 # %% Beside the prior on all joint forces, fitted to the same 20 samples
 fits = {
     name: forcegp.StructuredGP(system, "analytical", [prior], forcegp.Noise(0.1, torque=0.3)).fit(train)
-    for name, prior in {"the hose": pull, "all joint forces": forcegp.JointForcePrior()}.items()
+    for name, prior in {"the hose": pull, "all joint forces": forcegp.priors.JointForcePrior()}.items()
 }
 for name, fit in fits.items():
     found = fit.predict(q, qd, tau, "joint_force").mean - system.equations(q, qd).Q_K - tau

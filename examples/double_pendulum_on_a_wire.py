@@ -16,9 +16,12 @@ from forcegp.constraints import project_state
 figure = next((x for x in sys.argv[1:] if x.endswith(".png")), "double_pendulum_on_a_wire.png")
 torch.manual_seed(0)
 robot = forcegp.load_robot("double_pendulum")
-circle = forcegp.Cylinder(center=(0.4, 0.0, -0.2), axis=(0.0, 1.0, 0.0), radius=1.2)
+circle = forcegp.constraints.Cylinder(center=(0.4, 0.0, -0.2), axis=(0.0, 1.0, 0.0), radius=1.2)
 bead = forcegp.SurfaceContact("wire", frame="tip", point=(0.0, 0.0, 0.0), surface=circle)
-free, wire = forcegp.ConstrainedSystem(robot), forcegp.ConstrainedSystem(robot, [bead], forcegp.Baumgarte())
+free, wire = (
+    forcegp.ConstrainedSystem(robot),
+    forcegp.ConstrainedSystem(robot, [bead], forcegp.constraints.Baumgarte()),
+)
 
 
 # %% Logs of the true pendulum, whose joints have friction: 4 s free, 2 s on the wire
@@ -29,7 +32,7 @@ def torque(t: torch.Tensor, q: torch.Tensor, qd: torch.Tensor) -> torch.Tensor:
 def log(system: forcegp.ConstrainedSystem, duration: float) -> forcegp.Dataset:
     truth = system.with_robot(robot.replace(damping=robot.damping + 0.4, friction=robot.friction + 0.5))
     q0, qd0 = project_state(system, torch.tensor([0.5, -1.0]).double(), torch.zeros(2).double())
-    options = forcegp.RolloutOptions(dt=0.01)
+    options = forcegp.rollout.RolloutOptions(dt=0.01)
     path = forcegp.AnalyticalModel(truth).nominal().rollout(q0, qd0, torque, duration, options=options)
     forces = dict(zip(system.contact_names, path.multiplier.unbind(-1), strict=True))
     return forcegp.Dataset(
@@ -47,7 +50,7 @@ def log(system: forcegp.ConstrainedSystem, duration: float) -> forcegp.Dataset:
 train, test = log(free, 4.0)[::10], log(wire, 2.0)
 
 # %% A prior on the friction of each joint, fitted to 40 samples of free motion
-fit = forcegp.StructuredGP(free, "analytical", [forcegp.JointFrictionPrior()], noise=0.1).fit(train)
+fit = forcegp.StructuredGP(free, "analytical", [forcegp.priors.JointFrictionPrior()], noise=0.1).fit(train)
 
 # %% The force of the wire, and whether the predicted accelerations keep the bead on it
 force = fit.predict(test.q, test.qd, test.tau, "multiplier", system=wire)

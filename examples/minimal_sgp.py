@@ -25,7 +25,7 @@ from forcegp.gp.optimise import LearningOptions, minimise
 N, NOISE = 40, 0.1
 torch.manual_seed(0)
 robot = forcegp.load_robot("double_pendulum")
-circle = forcegp.Cylinder(center=(0.4, 0.0, -0.2), axis=(0.0, 1.0, 0.0), radius=1.2)
+circle = forcegp.constraints.Cylinder(center=(0.4, 0.0, -0.2), axis=(0.0, 1.0, 0.0), radius=1.2)
 bead = forcegp.SurfaceContact("wire", frame="tip", point=(0.0, 0.0, 0.0), surface=circle)
 system = forcegp.ConstrainedSystem(robot, [bead])
 

@@ -39,7 +39,7 @@ tau = tau + 0.5 * torch.randn_like(tau)  # noise of the torque sensors
 data = forcegp.Dataset(t=t, q=q, qd=qd, tau=tau, qdd=qdd, joint_names=system.robot.joint_names)
 
 # %% The mass is an unknown constant f, and E(x) f with E from `weight` is what it does to the joints
-prior = forcegp.OperatorForcePrior(
+prior = forcegp.priors.OperatorForcePrior(
     "mass", 1, weight, lambda system, at: {"one": torch.zeros_like(at.q[:, :1])}, Constant(group=1)
 )
 noise = forcegp.Noise(acceleration=0.01, torque=0.5)

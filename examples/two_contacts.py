@@ -19,12 +19,14 @@ robot = forcegp.load_robot("kuka_iiwa")
 q0 = torch.tensor([0.0, 0.7, 0.0, -1.5, 0.0, 0.9, 0.0], dtype=torch.float64)
 elbow = forcegp.kinematics.point_position(robot, q0, "lbr_iiwa_link_4")
 tip = forcegp.kinematics.point_position(robot, q0, "lbr_iiwa_link_7", (0.0, 0.0, 0.1))
-rail = forcegp.Cylinder((float(elbow[0]), 0.0, float(elbow[2]) - 0.1), (0.0, 1.0, 0.0), radius=0.1)
+rail = forcegp.constraints.Cylinder(
+    (float(elbow[0]), 0.0, float(elbow[2]) - 0.1), (0.0, 1.0, 0.0), radius=0.1
+)
 contacts = [
     forcegp.SurfaceContact("table", "lbr_iiwa_link_7", (0.0, 0.0, 0.1), forcegp.Plane(offset=float(tip[2]))),
     forcegp.SurfaceContact("rail", "lbr_iiwa_link_4", (0.0, 0.0, 0.0), rail),
 ]
-system = forcegp.ConstrainedSystem(robot, contacts, forcegp.Baumgarte())
+system = forcegp.ConstrainedSystem(robot, contacts, forcegp.constraints.Baumgarte())
 
 # %% A log of the true arm, which has friction in its joints
 friction = torch.tensor([3.0, 3.0, 2.0, 2.0, 0.2, 0.2, 0.02], dtype=torch.float64)
@@ -41,7 +43,7 @@ def torque(t: torch.Tensor, q: torch.Tensor, qd: torch.Tensor) -> torch.Tensor:
 
 
 arm = forcegp.AnalyticalModel(truth).nominal()
-path = arm.rollout(q0, qd0, torque, 3.0, options=forcegp.RolloutOptions(0.005))
+path = arm.rollout(q0, qd0, torque, 3.0, options=forcegp.rollout.RolloutOptions(0.005))
 data = forcegp.Dataset(
     t=path.t,
     q=path.q,
@@ -55,7 +57,7 @@ data = forcegp.Dataset(
 
 # %% Learn the friction from 40 samples of two seconds; predict both forces in the third
 train, test = data[:400:10], data[400:]
-model = forcegp.StructuredGP(system, "analytical", [forcegp.JointFrictionPrior()], noise=0.1)
+model = forcegp.StructuredGP(system, "analytical", [forcegp.priors.JointFrictionPrior()], noise=0.1)
 fit = model.fit(train)
 force = fit.predict(test.q, test.qd, test.tau, "multiplier")
 file = forcegp.AnalyticalModel(system).nominal().predict(test.q, test.qd, test.tau, "multiplier")

@@ -96,7 +96,9 @@ def test_options(name: str) -> None:
     def predicted(device: str) -> tuple[Tensor, Tensor]:
         settings: options.Settings = {
             "mean": "analytical",
-            "force_priors": [forcegp.JointForcePrior(SquaredExponential(("q", "qd")), inputs=("q", "qd"))],
+            "force_priors": [
+                forcegp.priors.JointForcePrior(SquaredExponential(("q", "qd")), inputs=("q", "qd"))
+            ],
             "noise": forcegp.Noise(torque=None),
         }
         settings = options.OPTIONS[name](settings)

@@ -48,7 +48,7 @@ def test_names_of_a_robot_file_are_text() -> None:
     contact = forcegp.SurfaceContact(HOSTILE, robot.frame_names[-1], (0, 0, 0), forcegp.Plane())
     system = forcegp.ConstrainedSystem(robot, [contact])
     data = random_log(20, joints=(HOSTILE, "elbow"))
-    shown = [robot, system, data, forcegp.StructuredGP(system, "zero"), forcegp.IndependentGP(system)]
+    shown = [robot, system, data, forcegp.StructuredGP(system, "zero"), forcegp.models.IndependentGP(system)]
     for one in shown:
         found = Tags(one._repr_html_())
         assert found.tags <= KNOWN

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import importlib
 import inspect
 import re
 import subprocess
@@ -22,6 +23,14 @@ def test_every_public_name_is_there_and_declared_for_type_checkers() -> None:
     declared = [alias for node in tree.body if isinstance(node, ast.ImportFrom) for alias in node.names]
     # Without `as`, a name in a stub is not exported.
     assert sorted(alias.asname or "" for alias in declared) == sorted(forcegp.__all__)
+
+
+@pytest.mark.parametrize(("name", "home"), vars(forcegp)["_MOVED"].items())
+def test_a_name_that_has_moved_still_works(name: str, home: str) -> None:
+    new = getattr(importlib.import_module(f"forcegp.{home}"), name)
+    with pytest.warns(DeprecationWarning, match=f"now forcegp.{home}.{name}; .* removed in 0.4"):
+        assert getattr(forcegp, name) is new
+    assert name not in forcegp.__all__
 
 
 def test_unknown_names_are_attribute_errors() -> None:

@@ -60,7 +60,7 @@ def test_other_threads_and_later_calls_keep_their_number() -> None:
 def test_threads_that_predict_get_the_same_numbers() -> None:
     system = table_system()
     model = forcegp.StructuredGP(system, "zero", noise=0.1).fit(
-        random_data(system, 12), options=forcegp.LearningOptions(max_evaluations=2)
+        random_data(system, 12), options=forcegp.models.LearningOptions(max_evaluations=2)
     )
     test = random_data(system, 20, seed=1)
     alone = model.predict(test.q, test.qd, test.tau)
@@ -96,16 +96,16 @@ def counts():
     pools = sorted((p["filepath"], p["num_threads"]) for p in threadpool_info())
     return torch.get_num_threads(), torch.get_num_interop_threads(), torch.get_default_dtype(), pools
 data, before = random_data(system, 12), counts()
-few = forcegp.LearningOptions(max_evaluations=2)
-for model in (forcegp.StructuredGP(system, noise=0.1), forcegp.IndependentGP(system, noise=0.1)):
+few = forcegp.models.LearningOptions(max_evaluations=2)
+for model in (forcegp.StructuredGP(system, noise=0.1), forcegp.models.IndependentGP(system, noise=0.1)):
     fit = model.fit(data, options=few)
     fit.predict(data.q, data.qd, data.tau)
     path = Path(tempfile.mkdtemp()) / "model"
     fit.save(path)
     loaded = forcegp.load_model(path)
-    options = forcegp.RolloutOptions(dt=0.01, on_divergence="keep")
+    options = forcegp.rollout.RolloutOptions(dt=0.01, on_divergence="keep")
     loaded.rollout(data.q[0], 0.0 * data.qd[0], 0.0 * data.tau, duration=0.05, options=options)
-forcegp.NeuralNetwork(system).fit(data, options=forcegp.models.minibatch.BatchOptions(epochs=1))
+forcegp.models.NeuralNetwork(system).fit(data, options=forcegp.models.minibatch.BatchOptions(epochs=1))
 forcegp.evaluate(loaded, data)
 after = counts()
 assert [x for x in after[3] if x[0] in dict(before[3])] == before[3], (before, after)
@@ -184,7 +184,7 @@ def test_the_blas_of_scipy_takes_the_threads_of_pytorch() -> None:
 def test_a_fit_of_columns_to_few_samples_runs_on_one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
     system, seen = table_system(), list[int]()
     data = random_data(system, 60)
-    few = forcegp.LearningOptions(max_evaluations=2)
+    few = forcegp.models.LearningOptions(max_evaluations=2)
     before = torch.get_num_threads()
     torch.set_num_threads(2)
 

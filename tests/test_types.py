@@ -21,16 +21,18 @@ system = scene.system()
 data = simulate(system, SimulationConfig(duration=2.0)).data[::16]
 plane = forcegp.Plane(normal=(0, 0, 1), offset=0.1)
 tip = forcegp.SurfaceContact("tip", "tool", (0, 0, 0.1), plane, radius=0.01)
-other = forcegp.ConstrainedSystem(forcegp.load_robot("ur5"), [tip], forcegp.Baumgarte())
-theta = forcegp.AnalyticalParameters(system.robot, {"mass": ["joint"], "damping": "all"})
-priors = [forcegp.SlidingFrictionPrior("table", terms=("viscous", "dry")), forcegp.JointFrictionPrior()]
+other = forcegp.ConstrainedSystem(forcegp.load_robot("ur5"), [tip], forcegp.constraints.Baumgarte())
+theta = forcegp.robot.AnalyticalParameters(system.robot, {"mass": ["joint"], "damping": "all"})
+sliding = forcegp.priors.SlidingFrictionPrior("table", terms=("viscous", "dry"))
+priors = [sliding, forcegp.priors.JointFrictionPrior()]
 noise = forcegp.Noise(torque="learn")
 model = forcegp.StructuredGP(system, "analytical", priors, noise, analytical_parameters=theta)
-fit = model.fit([forcegp.Observation(data), forcegp.Observation(data, "multiplier", noise_std=0.1)])
+sensed = forcegp.priors.Observation(data, "multiplier", noise_std=0.1)
+fit = model.fit([forcegp.priors.Observation(data), sensed])
 force = fit.predict(data.q, data.qd, data.tau, quantity="multiplier")
 if force.std is not None:
     print(force.mean + 2.0 * force.std, fit.result.warnings, fit.hyperparameters)
-path = fit.rollout(data.q[0], data.qd[0], data, samples=3, options=forcegp.RolloutOptions(dt=0.01))
+path = fit.rollout(data.q[0], data.qd[0], data, samples=3, options=forcegp.rollout.RolloutOptions(dt=0.01))
 print(path.q.shape, path.multiplier)
 fit.save("model")
 second = model.fit(data, learn=["noise"], after=fit).update(data)

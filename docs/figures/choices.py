@@ -74,7 +74,7 @@ def nominal(test: forcegp.Dataset) -> float:
 def model() -> None:
     train, test = logs()
     models = {
-        "gp": forcegp.IndependentGP(system()),
+        "gp": forcegp.models.IndependentGP(system()),
         "sgp-zero": forcegp.StructuredGP(system(), "zero"),
         "sgp": forcegp.StructuredGP(system(), mean="analytical"),
     }
@@ -84,16 +84,16 @@ def model() -> None:
 def prior() -> None:
     train, test = logs()
     priors = {
-        "JointForcePrior": forcegp.JointForcePrior(),
-        "ContactForcePrior": forcegp.ContactForcePrior("table"),
-        "SlidingFrictionPrior": forcegp.SlidingFrictionPrior("table"),
+        "JointForcePrior": forcegp.priors.JointForcePrior(),
+        "ContactForcePrior": forcegp.priors.ContactForcePrior("table"),
+        "SlidingFrictionPrior": forcegp.priors.SlidingFrictionPrior("table"),
     }
     models = {name: forcegp.StructuredGP(system(), "analytical", [one]) for name, one in priors.items()}
     draw_errors(errors(models, train, test), nominal(test), "prior")
 
 
 def stabilization() -> None:
-    from forcegp import RolloutOptions
+    from forcegp.rollout import RolloutOptions
 
     log = simulate(system(), SimulationConfig(duration=10.0, seed=1)).data
     fit = forcegp.StructuredGP(system(), "analytical").fit(log[::40])

@@ -118,7 +118,7 @@ def test_a_fit_of_another_robot_with_the_same_joints_is_refused() -> None:
     data = forcegp.Dataset(**columns, joint_names=robot.joint_names)
     models = [
         forcegp.StructuredGP(
-            forcegp.ConstrainedSystem(one, []), force_priors=[forcegp.JointForcePrior()], noise=0.1
+            forcegp.ConstrainedSystem(one, []), force_priors=[forcegp.priors.JointForcePrior()], noise=0.1
         )
         for one in (robot, heavier)
     ]

@@ -22,9 +22,9 @@ FRAME = ROBOT.frame_names[-1]
 def fit(tmp_path_factory: pytest.TempPathFactory) -> tuple[StructuredFit, forcegp.Dataset, Path]:
     folder = tmp_path_factory.mktemp("wrench")
     log = random_log(60, joints=ROBOT.joint_names)
-    options = forcegp.LearningOptions(max_evaluations=2)
+    options = forcegp.models.LearningOptions(max_evaluations=2)
     model = forcegp.StructuredGP(
-        forcegp.ConstrainedSystem(ROBOT), "analytical", [forcegp.JointFrictionPrior()], noise=0.5
+        forcegp.ConstrainedSystem(ROBOT), "analytical", [forcegp.priors.JointFrictionPrior()], noise=0.5
     )
     found = model.fit(log[::2], options=options)
     found.save(folder / "model")

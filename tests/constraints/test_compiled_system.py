@@ -15,9 +15,9 @@ ROBOT = forcegp.load_robot("kuka_iiwa", base_position=(0.1, 0.0, 0.05), base_rpy
 FRAME, POINT = "lbr_iiwa_link_7", (0.0, 0.0, 0.1)
 TABLE = forcegp.SurfaceContact("table", FRAME, POINT, forcegp.Plane((0.1, 0.0, 1.0), 0.055))
 BALL = forcegp.SurfaceContact(
-    "ball", "lbr_iiwa_link_5", (0.0, 0.1, 0.0), forcegp.Sphere((0.5, 0.0, -0.5), 0.4)
+    "ball", "lbr_iiwa_link_5", (0.0, 0.1, 0.0), forcegp.constraints.Sphere((0.5, 0.0, -0.5), 0.4)
 )
-HOOK = forcegp.PointConnection("hook", FRAME, POINT, "lbr_iiwa_link_0", (0.4, 0.1, 0.2))
+HOOK = forcegp.constraints.PointConnection("hook", FRAME, POINT, "lbr_iiwa_link_0", (0.4, 0.1, 0.2))
 SYSTEMS = {"free": (), "table": (TABLE,), "both": (TABLE, BALL), "hook": (HOOK, BALL)}
 
 
@@ -44,7 +44,7 @@ def test_equations_are_the_same(batch: tuple[int, ...]) -> None:
 
 @pytest.mark.parametrize("name", SYSTEMS)
 def test_one_state_and_further_points_are_the_same(name: str) -> None:
-    system = forcegp.ConstrainedSystem(ROBOT, SYSTEMS[name], forcegp.Baumgarte())
+    system = forcegp.ConstrainedSystem(ROBOT, SYSTEMS[name], forcegp.constraints.Baumgarte())
     compiled = compiled_system(system, (FRAME, POINT))
     if not isinstance(compiled, CompiledSystem):
         pytest.skip("needs a C++ compiler")

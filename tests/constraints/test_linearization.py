@@ -10,15 +10,8 @@ from torch import Tensor
 
 import forcegp
 from constraints.cases import random_state
-from forcegp import (
-    Baumgarte,
-    ConstrainedSystem,
-    ImplicitSurface,
-    Plane,
-    PointConnection,
-    Sphere,
-    SurfaceContact,
-)
+from forcegp import ConstrainedSystem, Plane, SurfaceContact
+from forcegp.constraints import Baumgarte, ImplicitSurface, PointConnection, Sphere
 from forcegp.errors import ShapeError
 
 STEP = 1e-6

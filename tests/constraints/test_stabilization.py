@@ -91,4 +91,4 @@ def test_stabilization_changes_b_alone() -> None:
 @pytest.mark.parametrize("value", [0.0, -1.0, float("inf"), float("nan")])
 def test_parameters_that_do_not_stabilize_are_refused(name: str, value: float) -> None:
     with pytest.raises(ForceGPError, match=rf"Baumgarte's {name} must be positive[\s\S]*baumgarte=None"):
-        forcegp.Baumgarte(**{name: value})
+        forcegp.constraints.Baumgarte(**{name: value})

@@ -13,12 +13,12 @@ from forcegp.forces.quantities import affine_map, states_at
 ALWAYS = 1e9
 SURFACES = (
     forcegp.Plane(normal=(0.6, 0.0, 0.8), offset=0.1),
-    forcegp.Sphere(center=(0.5, 0.0, -0.2), radius=0.4),
+    forcegp.constraints.Sphere(center=(0.5, 0.0, -0.2), radius=0.4),
 )
 
 
 def sticking(
-    surface: forcegp.Plane | forcegp.Sphere, radius: float, speed: float | None
+    surface: forcegp.Plane | forcegp.constraints.Sphere, radius: float, speed: float | None
 ) -> forcegp.ConstrainedSystem:
     robot = forcegp.load_robot("franka_panda")
     tip = SurfaceContact(
@@ -35,7 +35,7 @@ def states(seed: int, count: int = 5) -> tuple[Tensor, Tensor]:
 @pytest.mark.parametrize("surface", SURFACES)
 @pytest.mark.parametrize("radius", [0.0, 0.02])
 def test_the_right_hand_side_is_the_derivative_of_the_rows(
-    surface: forcegp.Plane | forcegp.Sphere, radius: float
+    surface: forcegp.Plane | forcegp.constraints.Sphere, radius: float
 ) -> None:
     """d(A q̇)/dt = A q̈ − b by central differences, where the point rests on the surface."""
     system = sticking(surface, radius, ALWAYS)
@@ -61,7 +61,7 @@ def test_a_resting_point_is_held_as_by_a_connection() -> None:
     at, _ = states_at(system, q, rest, tau, None)
     contact = system.contacts[0]
     assert isinstance(contact, SurfaceContact)
-    pin = forcegp.PointConnection("pin", contact.frame, contact.point, None, (0.0, 0.0, 0.0))
+    pin = forcegp.constraints.PointConnection("pin", contact.frame, contact.point, None, (0.0, 0.0, 0.0))
     pinned = forcegp.ConstrainedSystem(system.robot, [pin]).equations(q, rest)
     Q = at.eom.Q_K + tau
     torch.testing.assert_close(at.eom.acceleration(Q), pinned.acceleration(Q), atol=1e-9, rtol=1e-9)

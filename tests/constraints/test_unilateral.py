@@ -6,7 +6,8 @@ import pytest
 import torch
 
 import forcegp
-from forcegp import Baumgarte, ConstrainedSystem, Plane, PointConnection, SurfaceContact, dynamics, kinematics
+from forcegp import ConstrainedSystem, Plane, SurfaceContact, dynamics, kinematics
+from forcegp.constraints import Baumgarte, PointConnection
 from forcegp.constraints.unilateral import contact_forces, land, sliding_friction
 from robots import kinetic_energy
 

@@ -7,7 +7,8 @@ import torch
 from scipy.spatial.transform import Rotation as SciPyRotation
 
 import forcegp
-from forcegp import Baumgarte, ConstrainedSystem, Plane, SurfaceContact, dynamics, kinematics
+from forcegp import ConstrainedSystem, Plane, SurfaceContact, dynamics, kinematics
+from forcegp.constraints import Baumgarte
 from forcegp.control.task_space import (
     Gains,
     Target,

@@ -7,7 +7,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from forcegp import Cylinder, ImplicitSurface, Plane, Sphere
+from forcegp import Plane
+from forcegp.constraints import Cylinder, ImplicitSurface, Sphere
 from forcegp.constraints.surface import Surface
 from forcegp.control.trajectory import Chart, Reference, draw_waypoints, project, straight_lines, trapezoid
 from forcegp.errors import ForceGPError

@@ -315,7 +315,7 @@ def test_csv_log_with_its_accelerations_computed(tmp_path: Path) -> None:
     rows = ["t,q.a,tau.a,comment", *(f"{x!r},{float(np.sin(3 * x))!r},0.0,fine" for x in t.tolist())]
     (tmp_path / "log.csv").write_text("\n".join(rows))
     with pytest.warns(IgnoredColumnsWarning, match="comment"):
-        log = Dataset.read(tmp_path / "log.csv", differentiate=forcegp.SavitzkyGolay(window=11, order=4))
+        log = Dataset.read(tmp_path / "log.csv", differentiate=forcegp.data.SavitzkyGolay(window=11, order=4))
     # Bias of a quartic fitted to a sine over ±0.05 s.
     assert float((log.qd[:, 0] - torch.cos(3 * log.t) * 3).abs().max()) < 1e-3
     assert float((log.qdd[:, 0] + torch.sin(3 * log.t) * 9).abs().max()) < 0.1

@@ -58,7 +58,7 @@ def test_observations_of_two_logs_with_one_name_are_refused(tmp_path: Path) -> N
     logs = [imported(tmp_path / name, shift).named("run") for name, shift in (("a", 0.0), ("b", 0.1))]
     model = forcegp.StructuredGP(forcegp.ConstrainedSystem(ROBOT))
     with pytest.raises(DataError, match="two recordings are named 'run'"):
-        model.fit([forcegp.Observation(log) for log in logs])
+        model.fit([forcegp.priors.Observation(log) for log in logs])
 
 
 def test_a_column_numbers_the_recordings_of_a_log(tmp_path: Path) -> None:

@@ -170,7 +170,7 @@ def test_wrong_use_is_refused() -> None:
     with pytest.raises(DataError, match="nothing to evaluate on"):
         evaluate(forcegp.AnalyticalModel(system).nominal(), data[:0])
     with pytest.raises(AttributeError, match=r"call fit = model\.fit\(data\)"):
-        evaluate(forcegp.IndependentGP(system), data[:5])  # type: ignore[arg-type]
+        evaluate(forcegp.models.IndependentGP(system), data[:5])  # type: ignore[arg-type]
     with pytest.raises(DataError, match="joint"):
         evaluate(forcegp.AnalyticalModel(system).nominal(), data.select(tuple(reversed(data.joint_names))))
 

@@ -135,7 +135,7 @@ def test_a_log_whose_torque_is_gravity_is_named() -> None:
 def test_a_model_that_has_learned_the_controller_is_named() -> None:
     """A network that has seen one motion answers no torque that the controller did not choose."""
     data = swinging()
-    fit = forcegp.NeuralNetwork(FREE).fit(data[::8])
+    fit = forcegp.models.NeuralNetwork(FREE).fit(data[::8])
     found = evaluate(fit, data)
     assert found.response == torque_response(fit, ROBOT, data) and found.response is not None
     weak = min(found.response) < 0.5

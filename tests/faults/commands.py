@@ -126,7 +126,7 @@ def prepare(folder: Path) -> None:
     run, system = Dataset.read(folder / "run.parquet"), forcegp.load_scene(folder / "scene.toml").system()
     run[::6].write(folder / "train.parquet")
     model = forcegp.StructuredGP(system, "analytical", default_priors(system, "analytical"), 0.1).fit(
-        run[::12], options=forcegp.LearningOptions(max_evaluations=2)
+        run[::12], options=forcegp.models.LearningOptions(max_evaluations=2)
     )
     model.save(folder / "model")
     joints = enumerate(system.robot.joint_names)

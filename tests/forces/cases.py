@@ -33,8 +33,12 @@ def two_contacts(stabilized: bool = True) -> forcegp.ConstrainedSystem:
     """The KUKA arm with its tip on an inclined table and its elbow on a ball."""
     robot = forcegp.load_robot("kuka_iiwa", base_position=(0.1, 0.2, 0.05))
     table = forcegp.SurfaceContact("table", "lbr_iiwa_link_7", (0, 0, 0.1), forcegp.Plane((0, 0.2, 1), 0.055))
-    ball = forcegp.SurfaceContact("ball", "lbr_iiwa_link_5", (0.1, 0, 0.1), forcegp.Sphere((1, 1, 1), 0.3))
-    return forcegp.ConstrainedSystem(robot, [table, ball], forcegp.Baumgarte() if stabilized else None)
+    ball = forcegp.SurfaceContact(
+        "ball", "lbr_iiwa_link_5", (0.1, 0, 0.1), forcegp.constraints.Sphere((1, 1, 1), 0.3)
+    )
+    return forcegp.ConstrainedSystem(
+        robot, [table, ball], forcegp.constraints.Baumgarte() if stabilized else None
+    )
 
 
 def draw(n: int, seed: int = 0) -> tuple[Tensor, Tensor, Tensor]:
@@ -98,12 +102,12 @@ def friction_and_residual() -> list[ForcePrior]:
 
 
 def conditioned(
-    observations: forcegp.Dataset | list[forcegp.Observation], seed: int = 0, **settings: object
+    observations: forcegp.Dataset | list[forcegp.priors.Observation], seed: int = 0, **settings: object
 ) -> StructuredFit:
     """A fit with hyperparameters drawn at random around the start, conditioned, nothing learned."""
     settings = {"mean": "analytical", "force_priors": all_priors(), **settings}
     model = forcegp.StructuredGP(two_contacts(), **settings)  # type: ignore[arg-type]
-    fit = model.fit(observations, learn=["noise"], options=forcegp.LearningOptions(max_evaluations=1))
+    fit = model.fit(observations, learn=["noise"], options=forcegp.models.LearningOptions(max_evaluations=1))
     generator = torch.Generator().manual_seed(seed)
     values = {}
     for key, value in fit.hyperparameters.items():

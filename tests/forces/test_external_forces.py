@@ -29,7 +29,7 @@ def pushed(rows: int, seed: int) -> tuple[forcegp.ConstrainedSystem, forcegp.Dat
 
 
 def held(system: forcegp.ConstrainedSystem, data: forcegp.Dataset, noise: forcegp.Noise) -> StructuredFit:
-    model = forcegp.StructuredGP(system, "analytical", [forcegp.JointFrictionPrior()], noise=noise)
+    model = forcegp.StructuredGP(system, "analytical", [forcegp.priors.JointFrictionPrior()], noise=noise)
     return model.fit(data, learn=[])
 
 
@@ -96,15 +96,15 @@ def test_a_measured_contact_force_is_no_unknown_force() -> None:
         header=forcegp.data.DataHeader(unmeasured_torques=robot.joint_names[:1]),
     )
     Q = tau + push + forcegp.ConstrainedSystem(robot).equations(q, qd).Q_K
-    moved = forcegp.Observation(data)
-    joint = forcegp.Observation(data.replace(extras={"Q": Q}), "joint_force", 0.1)
+    moved = forcegp.priors.Observation(data)
+    joint = forcegp.priors.Observation(data.replace(extras={"Q": Q}), "joint_force", 0.1)
     sensed = data.replace(contact_extras={"F_I": {"floor": force}})
     true = float(push[:, 0].square().mean().sqrt())
     added = float(lever[:, 0].square().mean().sqrt())
     name = robot.joint_names[0]
     assert unmeasured_forces(system, [moved])[name] > 0.8 * added > 2.0 * true
     assert unmeasured_forces(system, [moved, joint])[name] == pytest.approx(true, rel=1e-6)
-    exact, vague = (forcegp.Observation(sensed, "contact_force", std) for std in (1e-6, 1e4))
+    exact, vague = (forcegp.priors.Observation(sensed, "contact_force", std) for std in (1e-6, 1e4))
     assert unmeasured_forces(system, [exact, moved])[name] == pytest.approx(true, rel=1e-6)
     assert unmeasured_forces(system, [vague, moved]) == unmeasured_forces(system, [moved])
 

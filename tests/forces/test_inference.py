@@ -91,7 +91,7 @@ def test_gradient_of_analytical_parameters() -> None:
     """Masses move M, and offsets also A, b and the inputs of the contact's prior."""
     robot = two_contacts().robot
     joints = robot.joint_names
-    theta = forcegp.AnalyticalParameters(
+    theta = forcegp.robot.AnalyticalParameters(
         robot, {"mass": joints[4:], "com": joints[5:], "damping": "all", "offset": joints[-1:]}
     )
     noise = forcegp.Noise(learn=True)
@@ -190,7 +190,7 @@ def test_redundant_and_nearly_redundant_contacts(angle: float) -> None:
     first, _ = two_contacts().contacts
     assert isinstance(first, forcegp.SurfaceContact)
     again = forcegp.SurfaceContact("ball", first.frame, first.point, forcegp.Plane((angle, 0.2, 1), 0.055))
-    system = forcegp.ConstrainedSystem(two_contacts().robot, [first, again], forcegp.Baumgarte())
+    system = forcegp.ConstrainedSystem(two_contacts().robot, [first, again], forcegp.constraints.Baumgarte())
     data = logged(system, 6)
     priors = default_priors(system, "analytical")
     model = forcegp.StructuredGP(system, "analytical", priors, noise=0.1).fit(data, learn=[])

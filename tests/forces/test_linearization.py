@@ -65,6 +65,6 @@ def test_batches_keep_their_shape_and_models_without_forces_are_refused() -> Non
     at = forcegp.AnalyticalModel(system).nominal().linearize(q, qd, tau)
     assert at.dq.shape == (2, 3, 7, 7)
     assert at.multiplier_dtau.shape == (2, 3, 2, 7)
-    network = forcegp.NeuralNetwork(system, hidden=[4]).fit(logged(system, 20))
+    network = forcegp.models.NeuralNetwork(system, hidden=[4]).fit(logged(system, 20))
     with pytest.raises(ModelError, match="no force field to linearize"):
         network.linearize(q, qd, tau)

@@ -53,7 +53,7 @@ def test_other_quantities_have_no_state_noise() -> None:
 
 def model(state: object = None) -> forcegp.StructuredGP:
     noise = forcegp.Noise(0.1, state=state)  # type: ignore[arg-type]
-    return forcegp.StructuredGP(two_contacts(), "analytical", [forcegp.JointForcePrior()], noise)
+    return forcegp.StructuredGP(two_contacts(), "analytical", [forcegp.priors.JointForcePrior()], noise)
 
 
 def test_likelihood_with_state_noise_is_the_dense_one() -> None:

@@ -27,7 +27,7 @@ def test_likelihood_with_weights_is_the_dense_one() -> None:
     model = forcegp.StructuredGP(
         two_contacts(),
         "analytical",
-        [forcegp.JointForcePrior()],
+        [forcegp.priors.JointForcePrior()],
         noise=forcegp.Noise(acceleration=0.1, torque=tuple(std.tolist())),
         inference="exact",
     )
@@ -63,7 +63,7 @@ def with_friction(impacts: bool) -> tuple[forcegp.ConstrainedSystem, forcegp.Dat
 def error(impacts: bool, degrees: float | None) -> tuple[float, StructuredFit]:
     """Mean absolute error of the friction of a new motion [N m]."""
     system, data = with_friction(impacts)
-    priors = [forcegp.JointFrictionPrior(load=False)]
+    priors = [forcegp.priors.JointFrictionPrior(load=False)]
     model = forcegp.StructuredGP(
         system,
         "analytical",

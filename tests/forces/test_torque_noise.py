@@ -39,7 +39,7 @@ def fitted(priors: list, torque_noise: object = tuple(STD.tolist()), n: int = 8,
     return model.fit(logged(two_contacts(), n), learn=[])
 
 
-@pytest.mark.parametrize("priors", [[forcegp.JointForcePrior()], [JointFrictionPrior()]])
+@pytest.mark.parametrize("priors", [[forcegp.priors.JointForcePrior()], [JointFrictionPrior()]])
 def test_likelihood_with_torque_noise_is_the_dense_one(priors: list) -> None:
     model = forcegp.StructuredGP(
         two_contacts(),

@@ -24,9 +24,9 @@ SURFACES: dict[str, Surface] = {
     "learned": forcegp.Plane((0, 0, 1), OFFSET),
     "raised": forcegp.Plane((0, 0, 1), OFFSET + 0.01),
     "tilted": forcegp.Plane(NORMAL, 0.5 * NORMAL[0] + OFFSET * NORMAL[2]),
-    "sphere": forcegp.Sphere((0.5, 0.0, OFFSET - 1.0), 1.0),
+    "sphere": forcegp.constraints.Sphere((0.5, 0.0, OFFSET - 1.0), 1.0),
 }
-SHORT = forcegp.LearningOptions(max_evaluations=60)
+SHORT = forcegp.models.LearningOptions(max_evaluations=60)
 EXACT = 1e-9
 """Rounding of accelerations that a model knows exactly [rad/s²]."""
 
@@ -48,8 +48,8 @@ def fitted(kind: str) -> StructuredFit:
     data = motion("learned", 0, 4.0)
     few = data[farthest_points(standardized(torch.cat([data.q, data.qd, data.tau], -1)), 60)]
     priors = {
-        "sliding": [forcegp.SlidingFrictionPrior("table")],
-        "any force": [forcegp.ContactForcePrior("table")],
+        "sliding": [forcegp.priors.SlidingFrictionPrior("table")],
+        "any force": [forcegp.priors.ContactForcePrior("table")],
         "defaults": default_priors(on("learned"), "analytical"),
     }
     return forcegp.StructuredGP(on("learned"), "analytical", priors[kind], noise=0.1).fit(few, options=SHORT)

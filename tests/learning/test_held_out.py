@@ -45,5 +45,5 @@ def test_noise_is_at_least_that_of_the_rounding_of_the_torque() -> None:
     qdd = forcegp.dynamics.forward_dynamics(system.robot, q, qd, tau - 0.1 * torch.tanh(qd))
     t = torch.arange(n, dtype=torch.float64)
     data = forcegp.Dataset(t, q, qd, tau, qdd, system.robot.joint_names)
-    fit = forcegp.StructuredGP(system, force_priors=[forcegp.JointFrictionPrior()]).fit(data)
+    fit = forcegp.StructuredGP(system, force_priors=[forcegp.priors.JointFrictionPrior()]).fit(data)
     assert bool((fit.hyperparameters[TORQUE_NOISE].exp() >= 0.999 * step / math.sqrt(12.0)).all())

@@ -117,7 +117,7 @@ def test_noise_of_each_row_moves_with_its_row() -> None:
     data, _ = logged(0.0)
     order = torch.randperm(len(data), generator=torch.Generator().manual_seed(0))
     noise = 1.0 + data.q.square()
-    (sorted_,) = observations_of([forcegp.Observation(data[order], noise_std=noise[order])])
+    (sorted_,) = observations_of([forcegp.priors.Observation(data[order], noise_std=noise[order])])
     assert torch.equal(sorted_.data.t, data.t) and torch.equal(torch.as_tensor(sorted_.noise_std), noise)
 
 

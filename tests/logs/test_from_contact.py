@@ -115,7 +115,7 @@ def test_a_contact_sticks_below_the_speed_of_the_log(
     read = import_log(path, system, parse_mapping(toml.encode(), "mapping")).data
     read.write(tmp_path / "log.parquet")
     stated = forcegp.Dataset.read(tmp_path / "log.parquet").header.stick_speeds
-    model = forcegp.StructuredGP(system, "analytical", [forcegp.JointForcePrior()])
+    model = forcegp.StructuredGP(system, "analytical", [forcegp.priors.JointForcePrior()])
     fit = model.fit(read[::10], learn=[])
     (contact,) = fit.system.contacts
     assert isinstance(contact, forcegp.SurfaceContact)
@@ -160,7 +160,7 @@ def test_a_fit_does_not_learn_from_torques_of_unknown_size() -> None:
     std = torch.zeros_like(tau)
     std[:20] = 1e6
     system = forcegp.ConstrainedSystem(robot)
-    model = forcegp.StructuredGP(system, "analytical", [forcegp.JointForcePrior()])
+    model = forcegp.StructuredGP(system, "analytical", [forcegp.priors.JointForcePrior()])
     without = model.fit(data[20:], learn=[])
     stated = model.fit(data.replace(extras={"tau_std": std}), learn=[], after=without)
     believed = model.fit(data, learn=[], after=without)

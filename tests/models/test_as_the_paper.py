@@ -9,8 +9,8 @@ import pytest
 import torch
 
 import forcegp
-from forcegp import LearningOptions
 from forcegp.learning.search import Search
+from forcegp.models import LearningOptions
 from forcegp.models.independent_gp import IndependentGP
 from forces.cases import draw, logged, two_contacts
 from forces.textbook import Textbook, squared_exponential
@@ -19,7 +19,7 @@ MAXIMUM_LIKELIHOOD = LearningOptions("adam", max_evaluations=5, warm_start=None,
 
 
 def model() -> forcegp.StructuredGP:
-    priors = [forcegp.JointForcePrior()]
+    priors = [forcegp.priors.JointForcePrior()]
     return forcegp.StructuredGP(
         two_contacts(), "analytical", priors, 0.1, inference="exact", standardize=False
     )

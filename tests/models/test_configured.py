@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from forcegp import LearningOptions, Noise
+from forcegp import Noise
 from forcegp.errors import SceneError, UnknownNameError
 from forcegp.forces import priors
 from forcegp.forces.priors.base import ForcePrior
@@ -21,6 +21,7 @@ from forcegp.forces.priors.memory import BristlePrior
 from forcegp.gp import kernels
 from forcegp.gp.kernels import Linear, Matern52, SquaredExponential, Sum
 from forcegp.learning.specification import WITH_PARAMETERS
+from forcegp.models import LearningOptions
 from forcegp.models.analytical import ADAM, AnalyticalModel, Window
 from forcegp.models.configured import Configured, configured, keys_of
 from forcegp.models.independent_gp import IndependentGP

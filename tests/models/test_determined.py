@@ -47,7 +47,7 @@ def with_contacts(*contacts: Constraint) -> forcegp.ConstrainedSystem:
 
 
 def fitted(system: forcegp.ConstrainedSystem, data: forcegp.Dataset) -> StructuredFit:
-    priors = [forcegp.JointFrictionPrior()]
+    priors = [forcegp.priors.JointFrictionPrior()]
     return forcegp.StructuredGP(system, "analytical", priors, noise=0.1).fit(data, learn=[])
 
 
@@ -175,13 +175,13 @@ def test_a_model_that_misses_its_data_by_far_says_by_how_much(data: forcegp.Data
 
 
 def test_options_without_effect_are_said(data: forcegp.Dataset) -> None:
-    joint = [forcegp.JointForcePrior()]
+    joint = [forcegp.priors.JointForcePrior()]
     assert 'inertia="auto" has no effect' in doubts_of(data, force_priors=joint, inertia="auto")
     exact = {"force_priors": joint, "inference": "exact"}
     assert "inducing_points=50 has no effect: the fit has exact" in doubts_of(
         data, inducing_points=50, **exact
     )
-    friction = [forcegp.JointFrictionPrior()]
+    friction = [forcegp.priors.JointFrictionPrior()]
     finite = {"force_priors": friction, "inference": "sparse", "inducing_points": 50}
     assert "priors with finitely many features" in doubts_of(data, **finite)
     used = {"force_priors": joint, "inference": "sparse", "inducing_points": 20}

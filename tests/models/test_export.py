@@ -69,7 +69,7 @@ def free_friction() -> StructuredFit:
     robot = robot.replace(drag=robot.mass.new_tensor([[0.2, 0.3]]).expand(robot.nq, 2))
     system = forcegp.ConstrainedSystem(robot)
     model = forcegp.StructuredGP(system, mean="analytical", force_priors=friction_priors(system))
-    return model.fit(free_log(robot, 120), options=forcegp.LearningOptions(max_evaluations=15))
+    return model.fit(free_log(robot, 120), options=forcegp.models.LearningOptions(max_evaluations=15))
 
 
 def free_inertial() -> StructuredFit:
@@ -91,7 +91,9 @@ def uncertain_inertia() -> StructuredFit:
 
 def one_contact() -> StructuredFit:
     """Friction of the joints and, coupled with the multiplier, of a contact."""
-    system = forcegp.ConstrainedSystem(two_contacts().robot, two_contacts().contacts[:1], forcegp.Baumgarte())
+    system = forcegp.ConstrainedSystem(
+        two_contacts().robot, two_contacts().contacts[:1], forcegp.constraints.Baumgarte()
+    )
     noise = forcegp.Noise(0.1, torque=0.3, external={"lbr_iiwa_joint_2": 0.5})
     model = forcegp.StructuredGP(system, "analytical", friction_priors(system), noise=noise)
     return model.fit(logged(two_contacts(), 60), learn=[])
@@ -140,9 +142,9 @@ def rounded_tip() -> StructuredFit:
     """A ball of a tip on a sphere, and one on a cylinder."""
     robot = forcegp.load_robot("kuka_iiwa")
     tip = forcegp.SurfaceContact(
-        "tip", "lbr_iiwa_link_7", (0, 0, 0.1), forcegp.Sphere((0.5, 0.1, -0.3), 0.4), radius=0.02
+        "tip", "lbr_iiwa_link_7", (0, 0, 0.1), forcegp.constraints.Sphere((0.5, 0.1, -0.3), 0.4), radius=0.02
     )
-    pipe = forcegp.Cylinder((0.3, -0.2, 0.1), (0.1, 1.0, 0.3), 0.1)
+    pipe = forcegp.constraints.Cylinder((0.3, -0.2, 0.1), (0.1, 1.0, 0.3), 0.1)
     side = forcegp.SurfaceContact("side", "lbr_iiwa_link_5", (0.05, 0, 0.1), pipe, radius=0.03)
     system = forcegp.ConstrainedSystem(robot, [tip, side])
     model = forcegp.StructuredGP(system, "analytical", friction_priors(system), noise=0.1)
@@ -339,7 +341,7 @@ def test_the_trained_region_is_that_of_the_last_fit() -> None:
         forcegp.ConstrainedSystem(robot), "analytical", [JointFrictionPrior()], noise=0.1
     )
     slow = free_log(robot, 20)
-    fast, few = slow.replace(qd=3.0 * slow.qd), forcegp.LearningOptions(max_evaluations=2)
+    fast, few = slow.replace(qd=3.0 * slow.qd), forcegp.models.LearningOptions(max_evaluations=2)
     first = model.fit(slow, learn=[])
     second = model.fit(fast, learn=["joint_friction"], after=first, options=few)
     before, after = (x.predict(fast.q, fast.qd, fast.tau).beyond for x in (first, second))
@@ -533,7 +535,7 @@ def test_single_precision_errs_by_what_the_export_states(name: str, compiler: st
         assert 1e-8 < float(ours) < 4.0 * stated, "other compilers round differently, but not much worse"
 
 
-class Bowl(forcegp.ImplicitSurface):
+class Bowl(forcegp.constraints.ImplicitSurface):
     """A surface without a C form."""
 
 
@@ -541,10 +543,13 @@ class Bowl(forcegp.ImplicitSurface):
     ("priors", "named"),
     [
         (
-            [JointFrictionPrior(), forcegp.PayloadPrior(known=(1.0, 0.0, 0.0, 0.0))],
+            [JointFrictionPrior(), forcegp.priors.PayloadPrior(known=(1.0, 0.0, 0.0, 0.0))],
             "'payload' cannot .* known payload.*PayloadPrior",
         ),
-        ([forcegp.OperatorForcePrior("wind", 7, lambda s, at: at.eom.M)], "'wind' cannot .*Python code"),
+        (
+            [forcegp.priors.OperatorForcePrior("wind", 7, lambda s, at: at.eom.M)],
+            "'wind' cannot .*Python code",
+        ),
     ],
     ids=["payload", "operator"],
 )
@@ -589,9 +594,11 @@ def test_two_priors_on_the_inertia_are_refused(kind: type, what: str) -> None:
 def test_a_contact_without_a_c_form_is_named(kind: str) -> None:
     robot, tool = forcegp.load_robot("kuka_iiwa"), ("tool", "lbr_iiwa_link_7", (0, 0, 0.1))
     contact = {
-        "implicit": lambda: forcegp.SurfaceContact(*tool, forcegp.ImplicitSurface(lambda p: p[2] - 0.1)),
+        "implicit": lambda: forcegp.SurfaceContact(
+            *tool, forcegp.constraints.ImplicitSurface(lambda p: p[2] - 0.1)
+        ),
         "sticking": lambda: forcegp.SurfaceContact(*tool, forcegp.Plane(), stick_speed=0.01),
-        "connection": lambda: forcegp.PointConnection(*tool, None, (0.5, 0.0, 0.5)),
+        "connection": lambda: forcegp.constraints.PointConnection(*tool, None, (0.5, 0.0, 0.5)),
     }[kind]()
     data = free_log(robot, 12).replace(contact={"tool": torch.ones(12, dtype=torch.bool)})
     system = forcegp.ConstrainedSystem(robot, [contact])

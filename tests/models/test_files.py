@@ -76,7 +76,10 @@ def test_an_analytical_model_that_was_read_learns_the_same(tmp_path: Path) -> No
 
 def test_a_surface_in_python_is_given_when_reading(tmp_path: Path) -> None:
     hill = forcegp.SurfaceContact(
-        "hill", "lbr_iiwa_link_7", (0.0, 0.0, 0.1), forcegp.ImplicitSurface(lambda p: p[2] - 0.1 * p[0] ** 2)
+        "hill",
+        "lbr_iiwa_link_7",
+        (0.0, 0.0, 0.1),
+        forcegp.constraints.ImplicitSurface(lambda p: p[2] - 0.1 * p[0] ** 2),
     )
     bumpy = forcegp.ConstrainedSystem(system.robot, [hill])
     model = forcegp.AnalyticalModel(bumpy).nominal()
@@ -168,7 +171,7 @@ def test_no_model_is_there(tmp_path: Path) -> None:
 
 def test_inputs_of_a_sparse_model_keep_their_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A file does not keep the order of its tensors; kernels that read all inputs depend on theirs."""
-    priors = [forcegp.JointForcePrior()]
+    priors = [forcegp.priors.JointForcePrior()]
     model = forcegp.StructuredGP(system, "analytical", priors, 0.1, inference="sparse").fit(
         data, options=SHORT
     )

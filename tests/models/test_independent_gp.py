@@ -8,10 +8,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from forcegp import IndependentGP, Noise
+from forcegp import Noise
 from forcegp.errors import DataError, ModelError, ShapeError
 from forcegp.gp.likelihood import negative_log_likelihood
 from forcegp.gp.optimise import LearningOptions
+from forcegp.models import IndependentGP
 from forcegp.models.independent_gp import IndependentFit
 from random_data import NOISE_STD, random_data, table_system
 

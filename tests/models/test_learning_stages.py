@@ -8,19 +8,20 @@ import pytest
 import torch
 
 import forcegp
-from forcegp import LearningOptions, Observation
 from forcegp.forces.priors.contact import ContactForcePrior, NormalForcePrior
 from forcegp.forces.priors.joint import JointForcePrior
+from forcegp.models import LearningOptions
 from forcegp.models.structured_fit import StructuredFit
+from forcegp.priors import Observation
 from forces.cases import draw, logged, mixed_contacts, two_contacts
 
 SHORT = LearningOptions(max_evaluations=3)
 data = logged(two_contacts(), 12)
 
 
-def theta() -> forcegp.AnalyticalParameters:
+def theta() -> forcegp.robot.AnalyticalParameters:
     robot = two_contacts().robot
-    return forcegp.AnalyticalParameters(robot, {"mass": robot.joint_names[-2:]})
+    return forcegp.robot.AnalyticalParameters(robot, {"mass": robot.joint_names[-2:]})
 
 
 def model(**settings: object) -> forcegp.StructuredGP:

@@ -6,8 +6,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from forcegp import NeuralNetwork
 from forcegp.errors import ModelError, NumericalError
+from forcegp.models import NeuralNetwork
 from forcegp.models.minibatch import BatchOptions, train
 from forcegp.models.neural import NetworkFit
 from random_data import random_data, table_system

@@ -60,7 +60,7 @@ def test_what_cannot_be_updated() -> None:
     with pytest.raises(ModelError, match="invalid forgetting factor"):
         sparse.forget(0.0)
     with pytest.raises(ModelError, match="contains quantities that"):
-        sparse.update([forcegp.Observation(data[:2], "multiplier", 1.0)])
+        sparse.update([forcegp.priors.Observation(data[:2], "multiplier", 1.0)])
 
 
 @pytest.mark.parametrize("inference", ["sparse", "exact"])

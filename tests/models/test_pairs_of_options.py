@@ -65,7 +65,7 @@ OPTIONS: dict[str, Callable[[Settings], Settings]] = {
     "noise of the state": with_noise(state=(1e-2, 5e-2)),
     "heavy tails": with_noise(degrees_of_freedom=4.0),
     "zero mean": lambda s: s | {"mean": "zero"},
-    "joint friction": with_prior(forcegp.JointFrictionPrior),
+    "joint friction": with_prior(forcegp.priors.JointFrictionPrior),
     "inertial prior": with_prior(InertialPrior),
     "analytical parameters": lambda s: s | {"analytical_parameters": theta()},
     "sparse": lambda s: s | {"inference": "sparse", "inducing_points": 6},

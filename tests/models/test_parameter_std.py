@@ -34,7 +34,7 @@ def fitted(
     qdd = forward_dynamics(true, q, qd, 5.0 * tau - 0.5 * qd)
     qdd = qdd + NOISE * torch.randn(n, 2, generator=generator, dtype=torch.float64)
     data = forcegp.Dataset(0.1 * torch.arange(n).double(), q, qd, 5.0 * tau, qdd, ROBOT.joint_names)
-    theta = forcegp.AnalyticalParameters(ROBOT, learn or {"mass": ROBOT.joint_names[-1:]})
+    theta = forcegp.robot.AnalyticalParameters(ROBOT, learn or {"mass": ROBOT.joint_names[-1:]})
     model = forcegp.StructuredGP(
         forcegp.ConstrainedSystem(ROBOT),
         "analytical",

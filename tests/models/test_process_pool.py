@@ -20,7 +20,7 @@ from forcegp.models.structured_fit import StructuredFit
 from random_data import random_data, table_system
 
 DATA = random_data(table_system(), 12)
-FEW = forcegp.LearningOptions(max_evaluations=2)
+FEW = forcegp.models.LearningOptions(max_evaluations=2)
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +64,7 @@ def test_a_worker_fits_a_model_to_the_same_bits(pool: ProcessPoolExecutor) -> No
 
 
 def test_a_fit_of_python_code_says_so_before_it_is_sent(pool: ProcessPoolExecutor) -> None:
-    hill = forcegp.OperatorForcePrior("own", 7, identity)
+    hill = forcegp.priors.OperatorForcePrior("own", 7, identity)
     fit = forcegp.StructuredGP(table_system(), "zero", force_priors=[hill], noise=0.1).fit(DATA, learn=[])
     with pytest.raises(ModelError, match="contains Python code"):
         pool.submit(predicted, fit, "qdd").result(timeout=120)

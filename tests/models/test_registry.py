@@ -20,8 +20,8 @@ def test_every_name_makes_its_model() -> None:
     kinds = {name: type(create(name, system)) for name in MODELS}
     assert kinds == {
         "analytical": forcegp.AnalyticalModel,
-        "nn": forcegp.NeuralNetwork,
-        "gp": forcegp.IndependentGP,
+        "nn": forcegp.models.NeuralNetwork,
+        "gp": forcegp.models.IndependentGP,
         "sgp-zero": forcegp.StructuredGP,
         "sgp-mean": forcegp.StructuredGP,
         "sgp-zero-se": forcegp.StructuredGP,
@@ -38,7 +38,7 @@ def test_the_structured_models_differ_in_mean_and_priors() -> None:
     zero, mean, contact = (create(f"sgp-{name}", system) for name in ("zero", "mean", "contact"))
     assert isinstance(zero, forcegp.StructuredGP) and isinstance(mean, forcegp.StructuredGP)
     assert isinstance(contact, forcegp.StructuredGP)
-    assert zero.mean.terms == () and mean.mean == contact.mean == forcegp.AnalyticalMean()
+    assert zero.mean.terms == () and mean.mean == contact.mean == forcegp.priors.AnalyticalMean()
     assert [prior.name for prior in zero.force_priors] == ["joint", "joint_normal"]
     assert [prior.name for prior in mean.force_priors] == ["joint", "joint_normal", "contact_table"]
     paper = create("sgp-mean-se", system)
@@ -49,7 +49,7 @@ def test_the_structured_models_differ_in_mean_and_priors() -> None:
 
 def test_noise_seed_and_options_arrive() -> None:
     network = create("nn", system, seed=5, hidden=(30, 20))
-    assert isinstance(network, forcegp.NeuralNetwork)
+    assert isinstance(network, forcegp.models.NeuralNetwork)
     assert (network.seed, network.hidden) == (5, (30, 20))
     analytical = create("analytical", system, seed=6, analytical_parameters={"mass": "all"})
     assert isinstance(analytical, forcegp.AnalyticalModel)

@@ -20,7 +20,7 @@ from forcegp.simulate import simulate
 
 WITHIN = 0.01
 """Largest relative error of a standard deviation."""
-FEW = forcegp.LearningOptions(max_evaluations=12)
+FEW = forcegp.models.LearningOptions(max_evaluations=12)
 """Rounding depends on where learning ends, and not on whether it is done."""
 OUTLIER = 1e8
 
@@ -56,7 +56,7 @@ CASES = [
     pytest.param("kuka_plane", "sgp", 40, {"force_priors": friction_priors}, marks=pytest.mark.slow),
     ("kuka_plane", "sgp-mean-se", 20, {}),
     pytest.param("ur5_free", "sgp-zero", 30, {}, marks=pytest.mark.slow),
-    ("ur5_free", "sgp-mean", 40, {"force_priors": (forcegp.JointForcePrior(Matern52()),)}),
+    ("ur5_free", "sgp-mean", 40, {"force_priors": (forcegp.priors.JointForcePrior(Matern52()),)}),
     ("ur5_free", "sgp", 60, {"force_priors": friction_priors}),
     pytest.param("ur5_wiping", "sgp-zero", 30, {}, marks=pytest.mark.slow),
     ("ur5_wiping", "sgp-mean", 30, {}),

@@ -23,11 +23,11 @@ def models() -> list[Model]:
         forcegp.StructuredGP(
             system,
             "zero",
-            [forcegp.JointForcePrior()],
+            [forcegp.priors.JointForcePrior()],
             noise=forcegp.Noise(learn=True, torque=0.1),
         ),
-        forcegp.IndependentGP(system, noise=0.3),
-        forcegp.NeuralNetwork(system, hidden=(5, 4), seed=3),
+        forcegp.models.IndependentGP(system, noise=0.3),
+        forcegp.models.NeuralNetwork(system, hidden=(5, 4), seed=3),
         forcegp.AnalyticalModel(system, seed=2),
     ]
 

@@ -9,8 +9,8 @@ import pytest
 import torch
 
 import forcegp
-from forcegp import LearningOptions
 from forcegp.forces.priors.joint import JointFrictionPrior
+from forcegp.models import LearningOptions
 from forcegp.models.analytical import Window
 from forcegp.models.minibatch import BatchOptions
 from forcegp.models.structured_fit import StructuredFit
@@ -25,13 +25,16 @@ CASES: dict[type, tuple[dict[str, Any], Any]] = {
         {
             "mean": "analytical",
             "noise": [0.1] * 7,
-            "force_priors": [forcegp.JointForcePrior()],
+            "force_priors": [forcegp.priors.JointForcePrior()],
             "inertia": None,
         },
         FEW,
     ),
-    forcegp.IndependentGP: ({"noise": [0.2] * 7, "standardize": False}, LearningOptions(max_evaluations=2)),
-    forcegp.NeuralNetwork: ({"hidden": [6, 5], "seed": 4}, EPOCHS),
+    forcegp.models.IndependentGP: (
+        {"noise": [0.2] * 7, "standardize": False},
+        LearningOptions(max_evaluations=2),
+    ),
+    forcegp.models.NeuralNetwork: ({"hidden": [6, 5], "seed": 4}, EPOCHS),
     forcegp.AnalyticalModel: (
         {"analytical_parameters": {"damping": "all"}, "window": Window(relative=0.2), "seed": 4},
         EPOCHS,

@@ -13,7 +13,7 @@ import pytest
 import torch
 
 import forcegp
-from forcegp import LearningOptions, StreamedDataset
+from forcegp import StreamedDataset
 from forcegp.cluster import cluster, on_cluster
 from forcegp.data import stream
 from forcegp.errors import ModelError
@@ -21,6 +21,7 @@ from forcegp.forces.priors.inertial import InertialPrior
 from forcegp.forces.priors.joint import JointFrictionPrior
 from forcegp.gp.sparse import SparsePosterior
 from forcegp.learning import streamed
+from forcegp.models import LearningOptions
 from forcegp.models.structured_fit import StructuredFit
 from forces.cases import draw, friction_and_residual, logged, mixed_contacts, two_contacts
 

@@ -299,14 +299,14 @@ def test_saved_models_are_exact_whatever_they_are_made_of(tmp_path: Path) -> Non
         Observation(logged(two_contacts(), 6)),
         Observation(logged(two_contacts(), 5, seed=4), "multiplier", [1.0, 2.0]),
     ]
-    mean = forcegp.AnalyticalMean(("gravity",))
+    mean = forcegp.priors.AnalyticalMean(("gravity",))
     model = conditioned(observations, force_priors=priors, mean=mean, noise=noise)
     model.save(tmp_path / "model")
     same(model, forcegp.load_model(tmp_path / "model"))
 
 
 def test_saved_models_keep_learned_analytical_parameters(tmp_path: Path) -> None:
-    theta = forcegp.AnalyticalParameters(
+    theta = forcegp.robot.AnalyticalParameters(
         table.robot, {"mass": table.robot.joint_names[-2:], "damping": "all"}
     )
     model = fitted(analytical_parameters=theta)
@@ -403,8 +403,8 @@ REFUSED: dict[str, tuple[Callable[[], object], type[Exception], str]] = {
         "without dots",
     ),
     "mean": (lambda: StructuredGP(table, "analytcal"), UnknownNameError, r"did you mean 'analytical'"),
-    "terms": (lambda: forcegp.AnalyticalMean(("bias", "bias")), ModelError, "'bias'.*twice"),
-    "term": (lambda: forcegp.AnalyticalMean(("gravty",)), UnknownNameError, "did you mean 'gravity'"),
+    "terms": (lambda: forcegp.priors.AnalyticalMean(("bias", "bias")), ModelError, "'bias'.*twice"),
+    "term": (lambda: forcegp.priors.AnalyticalMean(("gravty",)), UnknownNameError, "did you mean 'gravity'"),
     "contact": (
         lambda: fitted(force_priors=[ContactForcePrior("tabel")]),
         UnknownNameError,
@@ -492,7 +492,9 @@ def test_states_that_do_not_fit_are_refused(model: StructuredFit) -> None:
 def test_warm_start_ends_as_well_and_restarts_no_worse() -> None:
     data = logged(two_contacts(), 24)
     cold, warm, many = (
-        forcegp.StructuredGP(two_contacts(), "zero").fit(data, options=forcegp.LearningOptions(**options))
+        forcegp.StructuredGP(two_contacts(), "zero").fit(
+            data, options=forcegp.models.LearningOptions(**options)
+        )
         for options in ({"warm_start": None}, {"warm_start": 8}, {"warm_start": None, "restarts": 1})
     )
     assert cold.result.converged and warm.result.converged
@@ -532,10 +534,10 @@ def test_a_part_of_the_data_has_distinct_states() -> None:
 
 def test_the_normal_force_prior_changes_multipliers_alone() -> None:
     data = logged(two_contacts(), 10)
-    joint = forcegp.JointForcePrior()
-    normal = forcegp.NormalForcePrior(joint)
+    joint = forcegp.priors.JointForcePrior()
+    normal = forcegp.priors.NormalForcePrior(joint)
     plain = forcegp.StructuredGP(two_contacts(), "zero", force_priors=[joint]).fit(
-        data, options=forcegp.LearningOptions(max_evaluations=5)
+        data, options=forcegp.models.LearningOptions(max_evaluations=5)
     )
     open_ = forcegp.StructuredGP(two_contacts(), "zero", force_priors=[joint, normal]).fit(data, learn=[])
     start, learned = open_.hyperparameters, plain.hyperparameters
@@ -558,15 +560,15 @@ def test_the_normal_force_prior_changes_multipliers_alone() -> None:
 def test_contact_data_alone_tell_the_sum_of_two_forces() -> None:
     """Two priors on the same force cannot be told apart; one on free motion too can."""
     system = two_contacts()
-    same = forcegp.OperatorForcePrior(
+    same = forcegp.priors.OperatorForcePrior(
         "shadow",
         7,
         lambda s, at: torch.eye(7, dtype=at.q.dtype).expand(len(at.q), -1, -1),
         target="contact",
     )
     closed = logged(system, 12, active=torch.ones(12, 2, dtype=torch.bool))
-    model = forcegp.StructuredGP(system, "zero", force_priors=[forcegp.JointForcePrior(), same])
-    held = model.fit(closed, options=forcegp.LearningOptions(max_evaluations=2))
+    model = forcegp.StructuredGP(system, "zero", force_priors=[forcegp.priors.JointForcePrior(), same])
+    held = model.fit(closed, options=forcegp.models.LearningOptions(max_evaluations=2))
     assert held.result.force_correlation is not None
     assert held.result.force_correlation < -0.2
 

@@ -22,7 +22,7 @@ ROBOT = SYSTEM.robot
 
 
 def fitted(model: forcegp.StructuredGP) -> StructuredFit:
-    return model.fit(DATA, options=forcegp.LearningOptions(max_evaluations=1))
+    return model.fit(DATA, options=forcegp.models.LearningOptions(max_evaluations=1))
 
 
 FIT = fitted(MODEL)

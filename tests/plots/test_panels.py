@@ -126,7 +126,7 @@ def test_a_rollout_with_the_spread_of_its_samples() -> None:
     law = forcegp.AnalyticalModel(system).nominal()
     q = torch.tensor([0.3, -0.2], dtype=torch.float64)
     tau = torch.zeros(11, 2, dtype=torch.float64)
-    path = law.rollout(q, 0.0 * q, tau, duration=0.1, options=forcegp.RolloutOptions(0.01))
+    path = law.rollout(q, 0.0 * q, tau, duration=0.1, options=forcegp.rollout.RolloutOptions(0.01))
     spread = torch.stack([path.q + 0.1, path.q - 0.1, path.q])
     path = dataclasses.replace(path, samples=dataclasses.replace(path, q=spread))
     axes = path.plot(joints=[system.robot.joint_names[1]])

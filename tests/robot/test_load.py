@@ -16,7 +16,6 @@ import torch
 from scipy.spatial.transform import Rotation
 
 import forcegp
-import forcegp.robot.write_back
 from forcegp import dynamics, kinematics
 from forcegp.errors import (
     InertiaError,
@@ -28,6 +27,7 @@ from forcegp.errors import (
 )
 from forcegp.robot.load import BUNDLED
 from forcegp.robot.safety import MAX_BYTES, MAX_ELEMENTS
+from forcegp.robot.write_back import write_robot
 from robots import ARMS, example_data, random_states
 
 PUBLISHED_IIWA = Path(__file__).resolve().parents[3] / "shared/real/kuka_iiwa14/iiwa14.urdf"
@@ -469,9 +469,7 @@ def test_default_and_undeclared_namespaces_have_no_meaning(tmp_path: Path, head:
     plain = forcegp.load_robot(path)
     path.write_text(path.read_text().replace('<robot name="r">', head + extra))
     assert forcegp.load_robot(path).fingerprint == plain.fingerprint
-    written = forcegp.robot.write_back.write_robot(
-        plain.replace(mass=2.0 * plain.mass), path, tmp_path / "out.urdf"
-    )
+    written = write_robot(plain.replace(mass=2.0 * plain.mass), path, tmp_path / "out.urdf")
     assert {change.figure for change in written.changes} >= {"mass"}
     assert head + extra in (tmp_path / "out.urdf").read_text()
 

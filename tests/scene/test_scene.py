@@ -55,7 +55,7 @@ def test_the_bundled_scene_is_the_papers_task() -> None:
         "table", "lbr_iiwa_link_7", (0, 0, 0.1), forcegp.Plane(normal=(0, 0, 1), offset=0.055)
     )
     assert tuple(system.contacts) == (table,)
-    assert system.baumgarte == forcegp.Baumgarte(natural_frequency=10.0, damping_ratio=1.0)
+    assert system.baumgarte == forcegp.constraints.Baumgarte(natural_frequency=10.0, damping_ratio=1.0)
     assert system.robot.gravity.tolist() == [0, 0, -9.8]
     assert system.robot.base_position.tolist() == [0, 0, 0.05]
     assert (scene.simulation.dt, scene.simulation.viscous_friction) == (1 / 240, 1.0)

@@ -8,16 +8,8 @@ from functools import cache
 import pytest
 import torch
 
-from forcegp import (
-    Baumgarte,
-    ConstrainedSystem,
-    Cylinder,
-    PointConnection,
-    Sphere,
-    SurfaceContact,
-    load_robot,
-)
-from forcegp.constraints import ImplicitSurface
+from forcegp import ConstrainedSystem, SurfaceContact, load_robot
+from forcegp.constraints import Baumgarte, Cylinder, ImplicitSurface, PointConnection, Sphere
 from forcegp.errors import ForceGPError
 from forcegp.scene import load_scene
 from forcegp.simulate import ContactSolver, Sensors, SimulationConfig, SimulationResult, simulate

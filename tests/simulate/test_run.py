@@ -8,7 +8,8 @@ import pytest
 import torch
 
 import forcegp
-from forcegp import Baumgarte, ConstrainedSystem, Cylinder, Plane, Sphere, SurfaceContact, kinematics
+from forcegp import ConstrainedSystem, Plane, SurfaceContact, kinematics
+from forcegp.constraints import Baumgarte, Cylinder, Sphere
 from forcegp.constraints.surface import Surface
 from forcegp.errors import ForceGPError, NumericalError
 from forcegp.simulate import Gains, SimulationConfig, SimulationResult, simulate

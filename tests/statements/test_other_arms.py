@@ -53,7 +53,7 @@ TIP = forcegp.SurfaceContact(
     surface=forcegp.Plane(normal=(0.0, 0.0, 1.0), offset=0.05),
 )
 TABLE = forcegp.ConstrainedSystem(
-    file_of("ur10"), [TIP], baumgarte=forcegp.Baumgarte(natural_frequency=10.0, damping_ratio=1.0)
+    file_of("ur10"), [TIP], baumgarte=forcegp.constraints.Baumgarte(natural_frequency=10.0, damping_ratio=1.0)
 )
 
 

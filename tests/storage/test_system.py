@@ -15,14 +15,16 @@ from forcegp.storage.system import pack_system, unpack_system
 
 SURFACES = [
     forcegp.Plane(normal=(0.3, -0.2, 0.7), offset=0.1),
-    forcegp.Sphere(center=(0.5, 0.1, -1.0), radius=1.1),
-    forcegp.Cylinder(center=(0.5, 0.0, -0.3), axis=(0.1, 1.0, 0.3), radius=0.4),
+    forcegp.constraints.Sphere(center=(0.5, 0.1, -1.0), radius=1.1),
+    forcegp.constraints.Cylinder(center=(0.5, 0.0, -0.3), axis=(0.1, 1.0, 0.3), radius=0.4),
 ]
 
 
-def system_with(*contacts: forcegp.SurfaceContact | forcegp.PointConnection) -> forcegp.ConstrainedSystem:
+def system_with(
+    *contacts: forcegp.SurfaceContact | forcegp.constraints.PointConnection,
+) -> forcegp.ConstrainedSystem:
     robot = forcegp.load_robot("kuka_iiwa", base_position=(0.0, 0.0, 0.05), gravity=(0.0, 0.0, -9.8))
-    return forcegp.ConstrainedSystem(robot, contacts, baumgarte=forcegp.Baumgarte(9.0, 0.7))
+    return forcegp.ConstrainedSystem(robot, contacts, baumgarte=forcegp.constraints.Baumgarte(9.0, 0.7))
 
 
 def contact(surface: object, name: str = "table") -> forcegp.SurfaceContact:
@@ -36,7 +38,9 @@ def through_text(system: forcegp.ConstrainedSystem) -> tuple[dict, dict[str, Ten
 
 @pytest.mark.parametrize("surface", SURFACES, ids=lambda s: type(s).__name__)
 def test_round_trip_is_exact(surface: object) -> None:
-    connection = forcegp.PointConnection("rod", "lbr_iiwa_link_5", (0.0, 0.0, 0.1), None, (0.1, 0.2, 0.3))
+    connection = forcegp.constraints.PointConnection(
+        "rod", "lbr_iiwa_link_5", (0.0, 0.0, 0.1), None, (0.1, 0.2, 0.3)
+    )
     system = system_with(contact(surface), connection)
     read = unpack_system(*through_text(system), "here")
     assert read.contacts == system.contacts
@@ -54,7 +58,7 @@ def test_precision_is_kept() -> None:
 
 
 def test_a_surface_in_python_is_given_again() -> None:
-    own = contact(forcegp.ImplicitSurface(lambda p: p[2] - 0.055), "hill")
+    own = contact(forcegp.constraints.ImplicitSurface(lambda p: p[2] - 0.055), "hill")
     system = system_with(contact(SURFACES[0]), own)
     packed = through_text(system)
     with pytest.raises(ModelError, match=r"'hill' is a ImplicitSurface defined in Python.*\n.*load_model"):

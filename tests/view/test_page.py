@@ -134,7 +134,7 @@ def test_the_page_is_served_until_interrupted() -> None:
 def test_paths_of_a_rollout_are_added() -> None:
     system = forcegp.ConstrainedSystem(forcegp.load_robot("double_pendulum"))
     q = torch.tensor([0.3, -0.2], dtype=torch.float64)
-    tau, options = torch.zeros(1, 2, dtype=torch.float64), forcegp.RolloutOptions(0.01)
+    tau, options = torch.zeros(1, 2, dtype=torch.float64), forcegp.rollout.RolloutOptions(0.01)
     path = forcegp.AnalyticalModel(system).nominal().rollout(q, 0.0 * q, tau, 0.1, options=options)
     motion = with_rollout(Motion(system, np.zeros(1), q[None]), path)
     assert [p.kind for p in motion.paths] == ["predicted"]

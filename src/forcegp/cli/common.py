@@ -110,9 +110,9 @@ def check_data_destination(path: Path) -> None:
     check_destination(path)
 
 
-def derivatives(window: int | None) -> forcegp.SavitzkyGolay | None:
+def derivatives(window: int | None) -> forcegp.data.SavitzkyGolay | None:
     """Return the filter with a given window, or `None` if no window is given."""
-    return None if window is None else forcegp.SavitzkyGolay(window=window)
+    return None if window is None else forcegp.data.SavitzkyGolay(window=window)
 
 
 def read_data(

@@ -87,7 +87,7 @@ def evaluate(
     show(result, as_json)
 
 
-def _response(scores: forcegp.Evaluation, as_json: bool) -> object:
+def _response(scores: forcegp.evaluation.Evaluation, as_json: bool) -> object:
     """Return the effect of an added torque by joint, as numbers for JSON or as text."""
     if scores.response is None or as_json:
         return scores.response
@@ -96,7 +96,7 @@ def _response(scores: forcegp.Evaluation, as_json: bool) -> object:
 
 def _written(
     out: Path,
-    scores: forcegp.Evaluation,
+    scores: forcegp.evaluation.Evaluation,
     model: Predictor,
     test: forcegp.Dataset,
     names: tuple[str, str, str | None],

@@ -65,7 +65,7 @@ def rollout(
     log = _stretch(read_data(data, regression.specified.robot), start, duration)
     _say_contact(log, unilateral)
     dt = sampling_period(log)
-    options = forcegp.RolloutOptions(dt, method, stabilization, unilateral, on_divergence="keep")
+    options = forcegp.rollout.RolloutOptions(dt, method, stabilization, unilateral, on_divergence="keep")
     with progress_bar("rolling out", len(log) - 1) as progress:
         path = replayed(regression, log, samples, seed=seed, options=options, progress=progress)
     rolled = _as_data(path, log, dt)
@@ -81,7 +81,7 @@ def rollout(
     show({**_figures(path, rolled, dt), **written}, as_json)
 
 
-def _figures(path: forcegp.Rollout, rolled: forcegp.Dataset, dt: float) -> dict[str, object]:
+def _figures(path: forcegp.rollout.Rollout, rolled: forcegp.Dataset, dt: float) -> dict[str, object]:
     """Return the numbers to report, computed up to the point where the prediction diverges."""
     error = (rolled.q - rolled.q_logged).abs()
     figures: dict[str, object] = {
@@ -140,7 +140,7 @@ def _spread(q: Tensor) -> Tensor:
     return torch.from_numpy(np.nanstd(sound.numpy(), axis=0, ddof=1))
 
 
-def _as_data(path: forcegp.Rollout, log: forcegp.Dataset, dt: float) -> forcegp.Dataset:
+def _as_data(path: forcegp.rollout.Rollout, log: forcegp.Dataset, dt: float) -> forcegp.Dataset:
     """Return a data set with the simulated motion, up to a divergence, and the logged motion."""
     # A prediction that diverges between two rows ends at the first of them.
     length = min([len(path.t), *(round(diverged.t / dt) + 1 for diverged in path.diverged[:1])])

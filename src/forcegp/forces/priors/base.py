@@ -117,7 +117,7 @@ def check_priors(priors: tuple[ForcePrior, ...], system: ConstrainedSystem) -> N
         if not isinstance(prior, ForcePrior):
             raise ModelError(
                 "not a force prior",
-                expected="objects such as forcegp.JointFrictionPrior()",
+                expected="objects such as forcegp.priors.JointFrictionPrior()",
                 got=repr(prior),
                 hint="omit force_priors for all terms that apply to the log",
             )

@@ -153,7 +153,7 @@ class PerRecording(ForcePrior):
 
     Example:
         >>> import forcegp
-        >>> prior = PerRecording(forcegp.PayloadPrior(measured=True), ("monday", "tuesday"))
+        >>> prior = PerRecording(forcegp.priors.PayloadPrior(measured=True), ("monday", "tuesday"))
         >>> prior.outputs(forcegp.load_robot("ur5"))
         12
 

@@ -265,7 +265,7 @@ class NormalForcePrior(ForcePrior):
         like: the joint force prior that provides the kernel, inputs and hyperparameters.
 
     Example:
-        >>> from forcegp import JointForcePrior
+        >>> from forcegp.priors import JointForcePrior
         >>> NormalForcePrior(JointForcePrior()).target
         'constraint'
     """
