@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -154,6 +154,59 @@ def test_rows_in_which_a_servo_saturates_are_dropped(robot: forcegp.RobotModel, 
     assert found.data.tau[:, 0].abs().max() < 8.0
     with pytest.raises(DataError, match="saturates in every row"):
         import_log(raw, robot, mapping("limit = 1e-9"))
+
+
+def test_commands_of_velocities_and_torques_are_part_of_the_torque(
+    robot: forcegp.RobotModel, raw: Path, tmp_path: Path
+) -> None:
+    """τ = k_p (q_c − q) + k_d (q̇_c − q̇) + τ_c of late commands, in other units and with a sign."""
+    logged = dict(np.load(raw))
+    speed, torque = np.cos(3.0 * logged["t"]), 4.0 * np.sin(2.0 * logged["t"])
+    more = {"v": np.rad2deg(np.stack([speed, -speed, speed], axis=1)), "f": -np.stack([torque] * 3, axis=1)}
+    np.savez(tmp_path / "more.npz", **logged, **more)
+    tables = """delay = 0.012
+        [servo_velocity]
+        column = "v[{joint}]"
+        unit = "deg/s"
+        [servo_torque]
+        column = "f[{joint}]"
+        unit = "Nm"
+        sign = -1.0"""
+    plain = import_log(raw, robot, mapping("delay = 0.012")).data
+    data = import_log(tmp_path / "more.npz", robot, mapping(tables)).data
+    late = data.t.numpy() - DELAY
+    speeds = np.cos(3.0 * late)[:, None] * np.array([1.0, -1.0, 1.0])
+    added = WRONG * DAMPING * speeds + 4.0 * np.sin(2.0 * late)[:, None]
+    inner = slice(20, -20)
+    assert np.abs((data.tau - plain.tau).numpy() - added)[inner].max() < 0.02
+    with pytest.raises(MappingError, match="commands need those of positions"):
+        parse_mapping(
+            b'time = { column = "t" }\nposition = { column = "q", unit = "rad" }\n'
+            b'torque = { column = "c", unit = "Nm" }\nservo_torque = { column = "f", unit = "Nm" }',
+            "servo",
+        )
+
+
+def test_a_stiffness_without_nominal_value_is_found(
+    robot: forcegp.RobotModel, raw: Path, tmp_path: Path
+) -> None:
+    """Within 2 %, from positions with and without noise; the last servo moves hardly any link."""
+    asked = mapping()
+    unknown = {"a": "auto", "b": "auto", "c": 20.0}
+
+    def given(stiffness: object) -> Any:
+        servo = asked.sections.servo.model_copy(update={"stiffness": stiffness, "damping": 0.0})
+        return replace(asked, sections=asked.sections.model_copy(update={"servo": servo}))
+
+    random, log = np.random.default_rng(5), dict(np.load(raw))
+    noisy = tmp_path / "noisy.npz"
+    np.savez(noisy, **{**log, "q": log["q"] + 4e-4 * random.standard_normal(log["q"].shape)})
+    for path in (raw, noisy):
+        found = import_log(path, robot, given(unknown))
+        assert found.data.header.servo_stiffness == pytest.approx([*STIFFNESS[:2], 20.0], rel=0.02)
+        assert any("found the stiffness from the motion" in step for step in found.report.steps)
+    with pytest.raises(DataError, match="does not determine the stiffness of c"):
+        import_log(raw, robot, given("auto"))
 
 
 def test_invalid_servos_are_named(robot: forcegp.RobotModel, raw: Path) -> None:

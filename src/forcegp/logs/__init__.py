@@ -129,7 +129,7 @@ def import_log(
             even_clock(signals, log_mapping.sections.time.period, report)
             derive_joints(signals, system, log_mapping, report)
             smooth = without_noise(signals, log_mapping) if "tau" in signals.vectors else None
-            spring_torque(signals, system.robot, log_mapping, report)
+            log_mapping = spring_torque(signals, system.robot, log_mapping, report)
             _find_clipped(signals, log_mapping)
             evidence = _contacts(signals, system, log_mapping, report, displaced)
             std = add_derivatives(signals, log_mapping.sections.derivatives, report)

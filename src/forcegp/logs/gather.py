@@ -22,7 +22,7 @@ from forcegp.logs import units
 from forcegp.logs.base import FOOT, ORIENTATION, check_base, columns_of_base, orientations, place_base
 from forcegp.logs.clock import drop_repeated, find_held, join_stream, split_trajectories
 from forcegp.logs.headings import doubtful, named_like, tokens
-from forcegp.logs.mapping import LOGGED, SYMBOLS, Mapping
+from forcegp.logs.mapping import COMMANDS, LOGGED, SYMBOLS, TORQUES, Mapping
 from forcegp.logs.motion import TURNS, find_wrapped
 from forcegp.logs.readers import read
 from forcegp.logs.table import Array, ImportReport, LogTable, Progress, Signals, Stream
@@ -128,7 +128,7 @@ class _Gathering:
             return False
         columns = self.mapping.columns_of(name, self.joints)
         absent = [column for column in columns if column not in self.table.names]
-        if name in ("position", "torque", "servo") or not absent:
+        if name in ("position", "torque", *COMMANDS) or not absent:
             return True
         self.report.find("computed", f"the log has no column {absent[0]!r}: the {name} is computed")
         return False
@@ -168,7 +168,7 @@ class _Gathering:
                 f"joint {lacking[0]!r} has a coupled drive, but no column",
                 expected=f"a column for each of {', '.join(involved)}",
             )
-        convert = robot.joint_torque if name == "torque" else robot.joint_motion
+        convert = robot.joint_torque if name in TORQUES else robot.joint_motion
         return convert(torch.from_numpy(values).to(robot.coupling)).numpy()
 
     def _scale(self, name: str) -> Array:
@@ -181,7 +181,7 @@ class _Gathering:
 
         scale = numbers("sign") * units.QUANTITY[name][section.unit]
         if section.side == "motor":
-            scale *= numbers("gear_ratio") ** (1.0 if name == "torque" else -1.0)
+            scale *= numbers("gear_ratio") ** (1.0 if name in TORQUES else -1.0)
         if name == "torque" and self.mapping.torque.torque_constant is not None:
             scale *= numbers("torque_constant")
         result = np.ones(len(self.joints))

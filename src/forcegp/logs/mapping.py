@@ -141,8 +141,12 @@ def _value(value: object) -> str:
 
 SYMBOLS = {"position": "q", "velocity": "qd", "acceleration": "qdd", "torque": "tau"}
 """Names of the mapped quantities in a data set."""
-LOGGED = {**SYMBOLS, "servo": "command"}
+COMMANDS = {"servo": "command", "servo_velocity": "command_velocity", "servo_torque": "command_torque"}
+"""Names of the commands of servos."""
+LOGGED = {**SYMBOLS, **COMMANDS}
 """Names of the vectors that are read from a log."""
+TORQUES = ("torque", "servo_torque")
+"""Vectors that are torques, not motion."""
 ROS_NAMES = {"position": "position", "velocity": "velocity", "torque": "effort"}
 """Names of the mapped quantities in ROS joint states."""
 KNOWN_NAMES = {"t": "a data set", "header": "ROS joint states"}
@@ -151,6 +155,8 @@ ROWS = 100_000
 """Maximum number of rows from which a mapping is proposed. One message may lack joints or quantities."""
 PerJoint = float | dict[str, float]
 """One number for all joints, or one number for each joint name."""
+Unknown = Literal["auto"]
+"""A number that is found from the log."""
 
 
 Compensated = Literal["gravity", "model"]
@@ -220,10 +226,12 @@ class TorqueSection(QuantitySection):
 
 class ServoSection(QuantitySection):
     """`[servo]`: commanded positions in place of torques, and the nominal stiffness and damping of each servo
-    [N m/rad, N m s/rad], with the relative standard deviation of the stiffness. Rows in which a torque
-    exceeds `limit` [N m] are dropped. The `delay` of commands [s] is found from the motion unless given."""
+    [N m/rad, N m s/rad], with the relative standard deviation of the stiffness; `"auto"` finds it from the
+    motion and the masses in the robot file. Rows in which a torque
+    exceeds `limit` [N m] are dropped. The `delay` of commands [s] is found from the motion unless given.
+    Commanded velocities and torques are in `[servo_velocity]` and `[servo_torque]`."""
 
-    stiffness: PerJoint
+    stiffness: float | Unknown | dict[str, float | Unknown]
     damping: PerJoint = 0.0
     limit: PerJoint | None = None
     delay: Annotated[float, Field(ge=0.0)] | Literal["auto"] = "auto"
@@ -333,6 +341,8 @@ class MappingSections(Section):
     acceleration: QuantitySection | None = None
     torque: TorqueSection | None = None
     servo: ServoSection | None = None
+    servo_velocity: QuantitySection | None = None
+    servo_torque: QuantitySection | None = None
     wrench: WrenchSection | None = None
     base: BaseSection | None = None
     contact: dict[str, ContactStateSection] = Field(default_factory=dict)
@@ -400,15 +410,16 @@ class Mapping:
         return columns
 
     def per_joint(self, name: str, key: str, joints: Sequence[str]) -> NDArray[np.float64]:
-        """Return the values (nq,) of a key that has either one value for all joints or one per joint."""
-        value: PerJoint = getattr(self.quantity(name), key)
+        """Return the values (nq,) of a key that has either one value for all joints or one per joint. They
+        are NaN for `"auto"`."""
+        value = getattr(self.quantity(name), key)
         if not isinstance(value, dict):
-            return np.full(len(joints), float(value))
+            return np.full(len(joints), _number(value))
         self._check_joints((name, key), value, joints)
         for joint in joints:
             if joint not in value:
                 raise self.error((name, key), f"joint {joint!r} is missing", expected=", ".join(joints))
-        return np.array([value[joint] for joint in joints])
+        return np.array([_number(value[joint]) for joint in joints])
 
     def error(
         self, key: Key, message: str, expected: object = None, got: object = None, hint: str | None = None
@@ -421,6 +432,10 @@ class Mapping:
             if joint not in joints:
                 text, hint = f"{joint!r} is not a joint of the robot", did_you_mean(joint, joints)
                 raise self.error((*key, joint), text, expected=", ".join(joints), hint=hint)
+
+
+def _number(value: float | Unknown) -> float:
+    return np.nan if value == "auto" else float(value)
 
 
 def load_mapping(source: str | Path) -> Mapping:
@@ -461,9 +476,17 @@ def _check(mapping: Mapping) -> None:
             (),
             "torques or commands of servos are needed, and not both",
             expected="[torque], or [servo] with the nominal stiffness of each servo",
-            hint="of a log without torque, only ratios of stiffness, friction and drive inertia follow where "
-            "links and gravity are small: a nominal stiffness fixes their scale",
+            hint='the masses in the robot file fix the scale: stiffness = "auto" finds it where links resist',
         )
+    for name in COMMANDS:
+        if sections.servo is None and mapping.quantity(name) is not None:
+            expected = "[servo] with commanded positions and the nominal stiffness"
+            raise mapping.error((name,), "these commands need those of positions", expected)
+        gains = [] if sections.servo is None else sections.servo.stiffness
+        unknown = "auto" in (gains.values() if isinstance(gains, dict) else [gains])
+        if name != "servo" and unknown and mapping.quantity(name) is not None:
+            text = "commands of velocities and torques need a nominal stiffness"
+            raise mapping.error(("servo", "stiffness"), text, "a number for each joint", "auto")
     torque = mapping.torque
     if (torque.unit in units.CURRENT) != (torque.torque_constant is not None):
         text, got = "a current needs a torque constant, and nothing else has one", repr(torque.unit)
@@ -548,7 +571,7 @@ def _check_quantity(mapping: Mapping, name: str, section: QuantitySection) -> No
     for key, (what, right) in valid.items():
         value = getattr(section, key, None)
         numbers = value.values() if isinstance(value, dict) else [] if value is None else [value]
-        wrong = [number for number in numbers if not right(number)]
+        wrong = [number for number in numbers if number != "auto" and not right(number)]
         if wrong:
             raise mapping.error((name, key), f"not a valid {key.replace('_', ' ')}", what, wrong[0])
 

@@ -18,6 +18,8 @@ QUANTITY: Mapping[str, Mapping[str, float]] = {
     **_UNITS,
     "torque": {**TORQUE, **CURRENT},
     "servo": _UNITS["position"],
+    "servo_velocity": VELOCITY,
+    "servo_torque": TORQUE,
 }
 """Factors that convert the units of each mapped quantity to SI units. Currents are converted to amperes."""
 SI = {name: next(iter(_UNITS[name])) for name in ("position", "velocity", "acceleration", "torque")}
