@@ -57,6 +57,12 @@ def test_friction_of_a_still_joint_stays_at_its_prior(speed_noise: float) -> Non
     offset = own[f"joint_friction.offset of {name}"]
     assert offset.value == pytest.approx(-STATIC, abs=0.1)
     assert any("do not move" in doubt and name in doubt for doubt in fit.result.warnings)
+    for one in fit.robot_parameters():
+        if one.name.endswith("friction") and one.of == name:
+            assert not one.determined
+        elif one.name == "fast friction":
+            assert one.determined and one.std is not None and one.speed is not None
+            assert abs(one.value - 3.0 - one.speed) < 4.0 * one.std
 
 
 def test_samples_of_a_still_joint_are_forgotten_as_they_were_learned() -> None:

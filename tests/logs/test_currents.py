@@ -95,7 +95,8 @@ def test_torque_constants_are_learned_where_links_fix_them(fit: StructuredFit, f
     assert last.value == 0.0
     known = forcegp.read_log(folder / "train.npz", fit.specified.robot, mapping("torque_constant_std = 0.0"))
     assert known.header.torque_scale_std is None
-    assert any("torques over the nominal ones" in warning for warning in fit.result.warnings)
+    named = {p.of: p.value for p in fit.robot_parameters() if p.name == "torque scale" and p.determined}
+    assert named == {joint: 1.0 + own[f"drives.scale of {joint}"].value for joint in "ab"}
 
 
 def test_programs_and_files_have_the_scales(fit: StructuredFit, folder: Path, tmp_path: Path) -> None:

@@ -111,9 +111,9 @@ def test_gains_are_learned_where_links_fix_their_scale(robot: forcegp.RobotModel
         assert scale.determined
         assert abs(scale.value - (1.0 / wrong - 1.0)) < 3.0 * scale.std + 0.01
         assert scale.std < 0.15
-    (said,) = [doubt for doubt in fit.result.warnings if "nominal" in doubt]
-    assert said.startswith("torques over the nominal ones")
-    assert said.endswith("not determined, and therefore nominal: c")
+    named = {p.of: p for p in fit.robot_parameters() if p.name == "torque scale"}
+    assert [named[joint].determined for joint in "abc"] == [True, True, False]
+    assert named["a"].value == 1.0 + own["drives.scale of a"].value and named["c"].value == 1.0
     last = own["drives.scale of c"]
     assert (last.value, last.std, last.determined) == (0.0, pytest.approx(0.3), False)
     # Relative to the nominal torque of this servo

@@ -41,6 +41,7 @@ from forcegp.forces.term import JointTerm
 from forcegp.identification import regressor
 from forcegp.models.friction_law import RATE, Laws, Reversals, laws_of
 from forcegp.models.parameters import SCALE, is_identified
+from forcegp.models.robot_parameters import MOMENTS
 from forcegp.models.structured_fit import StructuredFit
 from forcegp.robot.inertia import from_pseudo_inertia, inertial_parameters, pseudo_inertia, pseudo_inertia_of
 from forcegp.robot.model import RobotModel
@@ -66,8 +67,6 @@ STATES = 400
 """Number of random states used to add drive inertia to links."""
 WANTED = 0.01
 """Target relative torque error ε."""
-MOMENTS = ("mass", "mass·x", "mass·y", "mass·z", "Ixx", "Ixy", "Ixz", "Iyy", "Iyz", "Izz")
-"""Inertial parameters of a link about its origin [kg, kg m, kg m²]."""
 FIGURES = ("damping", "friction", *MOMENTS, "armature")
 LAW = (*DRAG, *BRISTLE[1:])
 """Names of the parameters of a joint, and of those of friction that only MJCF supports."""

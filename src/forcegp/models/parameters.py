@@ -7,8 +7,7 @@ N(A⁻¹v, A⁻¹).
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -52,39 +51,6 @@ class LearnedParameter:
     std: float
     unit: str
     determined: bool
-
-
-def clear_drives(
-    parameters: Callable[[], Iterable[LearnedParameter]], file: RobotModel, robot: RobotModel
-) -> tuple[str, ...]:
-    """Return a warning about drives with inertia that the file lacks, if ±2σ excludes zero.
-
-    Args:
-        parameters: function that returns the learned parameters, which is called if there are such drives.
-        file, robot: the robot of the file, and the identified robot.
-    """
-    added = (robot.armature - file.armature).tolist()
-    if max(added) <= 0.0:
-        return ()
-    std = {each.name.split(".", 1)[-1]: each.std for each in parameters()}
-    bars = (2.0 * std.get(f"drive of {name}", math.inf) for name in robot.joint_names)
-    named = zip(robot.joint_names, added, bars, strict=True)
-    clear = [f"{name} {a:.2g} ± {bar:.1g}" for name, a, bar in named if a > bar]
-    lacks = "the drives have inertia that the robot file lacks [kg m², kg for sliding joints; ± 2σ]"
-    return (f"{lacks}: {', '.join(clear)}",) if clear else ()
-
-
-def torque_scales(parameters: Sequence[LearnedParameter]) -> tuple[str, ...]:
-    """Return a sentence about torques over the nominal ones, if their scale is an unknown."""
-    found = [(each.name.split(SCALE)[1], each) for each in parameters if SCALE in each.name]
-    if not found:
-        return ()
-    known = [f"{joint} {1.0 + p.value:.3g} ± {2.0 * p.std:.1g}" for joint, p in found if p.value]
-    rest = [joint for joint, p in found if not p.value]
-    sentence = f"torques over the nominal ones [± 2σ]: {', '.join(known) or 'none is determined'}"
-    if known and rest:
-        sentence += f"; not determined, and therefore nominal: {', '.join(rest)}"
-    return (sentence,)
 
 
 def is_identified(priors: Sequence[ForcePrior]) -> bool:

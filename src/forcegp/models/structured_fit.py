@@ -59,6 +59,7 @@ from forcegp.models.fit_result import FitResult
 from forcegp.models.parameter_std import parameter_std
 from forcegp.models.parameters import LearnedParameter, learned_parameters
 from forcegp.models.prediction import Answer, Prediction, Query, in_pieces
+from forcegp.models.robot_parameters import RobotParameter, robot_parameters
 from forcegp.models.structured_file import pack, unpack
 from forcegp.rollout.inputs import Disturbance
 from forcegp.storage.model_file import ModelHeader
@@ -227,6 +228,18 @@ class StructuredFit(FittedModel):
             `for each in fit.parameters(): print(each.name, each.value, each.std, each.unit)`
         """
         return learned_parameters(self.posterior, self.hyperparameters, self.system.robot)
+
+    def robot_parameters(self) -> tuple[RobotParameter, ...]:
+        """Return the learned parameters of the robot and its contacts, with standard deviations.
+
+        Friction and offsets are averages over training samples, which files of sparse fits do not contain.
+
+        Example:
+            `for each in fit.robot_parameters(): print(each.name, each.of, each.value, each.std, each.unit)`
+        """
+        friction, file = self.hyperparameters, self.specified.robot
+        columns, training = self.parameters(), self.problem.training
+        return robot_parameters(self.posterior, columns, friction, training, file, self.system)
 
     def external_wrench(
         self,

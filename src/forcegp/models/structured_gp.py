@@ -21,7 +21,6 @@ from forcegp.errors import ModelError
 from forcegp.forces.measurements import NoiseStd, Observation, excluded, observations_of
 from forcegp.forces.noise import Noise, state_std_of
 from forcegp.forces.priors.base import ForcePrior, check_priors
-from forcegp.forces.priors.constants import DrivePrior
 from forcegp.forces.priors.joint import AnalyticalMean, JointFrictionPrior, mean_of
 from forcegp.forces.priors.sets import default_priors, friction_priors
 from forcegp.forces.problem import require_double
@@ -32,7 +31,6 @@ from forcegp.learning.regression import SAMPLES, are_columns
 from forcegp.learning.specification import Specification, check_learned, problem_for, search_of
 from forcegp.learning.streamed import Pass, Sample, sample_of
 from forcegp.models.base import FitProgress, Model
-from forcegp.models.parameters import clear_drives, torque_scales
 from forcegp.models.structured_fit import KIND, StructuredFit, conditioned
 from forcegp.options import StructuredOptions
 from forcegp.resources import one_thread
@@ -207,10 +205,7 @@ class StructuredGP(Model[StructuredFit]):
         fit = conditioned(spec, lesson.problem, values, lesson.learned, warnings, lesson.learned_on, forces)
         if progress is not None:
             progress(fit.result.evaluations, fit.result.evaluations, fit.result.objective)
-        drives = clear_drives(fit.parameters, self.system.robot, fit.system.robot)
-        unknown = any(isinstance(prior, DrivePrior) for prior in fit.force_priors)
-        scales = torque_scales(fit.parameters()) if unknown else ()
-        warnings = (*fit.result.warnings, *drives, *scales, *self._without_effect(fit))
+        warnings = (*fit.result.warnings, *self._without_effect(fit))
         result = dataclasses.replace(fit.result, worth=dict(lesson.worth), warnings=warnings)
         return dataclasses.replace(fit, result=result)
 
