@@ -15,9 +15,12 @@ from typer.testing import CliRunner
 
 import forcegp
 from forcegp.cli import app, main
-from forcegp.cli.fit import readable_input
+from forcegp.cli.common import rounded
+from forcegp.cli.fit import _listed
 from forcegp.data import Dataset
+from forcegp.models.robot_parameters import RobotParameter
 from logs import JOINTS, random_log
+from planted_faults import free_log
 
 COMMANDS = ("simulate", "select", "fit", "predict", "evaluate", "rollout", "import")
 
@@ -246,30 +249,35 @@ def test_from_simulation_to_evaluation(fail: Fail, tmp_path: Path) -> None:
     assert "is not a saved model" in fail("evaluate", "-m", tmp_path, "-d", test)
 
 
-def test_fit_prints_words_and_json_prints_names(tmp_path: Path) -> None:
-    """A joint that does not move, in words of the robot; programs read the names of the inputs."""
-    joints = forcegp.load_robot("double_pendulum").joint_names
-    log = random_log(200, joints=joints)
-    still = torch.tensor([1.0, 0.0], dtype=log.q.dtype)
-    log.replace(q=still * log.q, qd=still * log.qd, contact={}, contact_extras={}).write(
-        tmp_path / "log.parquet"
-    )
-    arguments = ["fit", "--robot", "double_pendulum", "--data", tmp_path / "log.parquet", "--model", "nn"]
+def test_fit_prints_what_an_engineer_reads_and_the_rest_on_request(tmp_path: Path) -> None:
+    """Friction, drives and noise of each joint; JSON has the same numbers and those of the computation."""
+    system = forcegp.ConstrainedSystem(forcegp.load_robot("double_pendulum"))
+    free = free_log(system.robot, seconds=10.0)
+    columns = {name: torch.from_numpy(getattr(free, name)) for name in ("t", "q", "qd", "qdd")}
+    tau = torch.from_numpy(free.tau) + 0.5 * torch.tanh(columns["qd"] / 0.02) + 0.1 * columns["qd"]
+    joints, header = system.robot.joint_names, free.header
+    data = Dataset(**columns, tau=tau, joint_names=joints, header=header)
+    data.write(tmp_path / "log.parquet")
+    arguments = ["fit", "--robot", "double_pendulum", "--data", tmp_path / "log.parquet"]
     text = run(*arguments, "--out", tmp_path / "text")
-    assert f"position of {joints[1]}, velocity of {joints[1]}" in text and "[1]" not in text
+    for internal in ("jitter", "objective", "evidence", "nats", "force_correlation"):
+        assert internal not in text and internal not in text.replace(" ", "_")
+    assert len(text.splitlines()) <= len(joints) + 8
+    table = {line.split()[0]: line for line in text.splitlines()}
     found = json.loads(run(*arguments, "--out", tmp_path / "json", "--json"))
-    assert found["constant_inputs"] == ["q[1]", "qd[1]"]
-    assert found["seconds"] > 0.0
+    assert found["jitter"] == 0.0 and found["seconds"] > 0.0
+    for name, joint in ((name, joint) for name in ("slow friction", "fast friction") for joint in joints):
+        (one,) = (p for p in found["robot_parameters"] if (p["name"], p["of"]) == (name, joint))
+        assert abs(one["value"] - 0.5 - 0.1 * one["speed"]) < 4.0 * one["std"] + 0.02
+        assert f"{rounded(one['value'], one['std'])} at {one['speed']:.2g}" in table[joint]
+    verbose = run(*arguments, "--out", tmp_path / "verbose", "--verbose")
+    assert "jitter" in verbose and f"joint_friction of {joints[0]}" in verbose
 
 
-@pytest.mark.parametrize(
-    ("name", "words"),
-    [
-        ("joint_friction.load[0]", "gravity load of shoulder (joint_friction)"),
-        ("joint_friction.coulomb_1[1]", "direction of motion of elbow (joint_friction)"),
-        ("contact_table.slip[2]", "slip, component 3 (contact_table)"),
-        ("mine.reading[7]", "reading, component 8 (mine)"),
-    ],
-)
-def test_inputs_are_named_by_joints_where_they_belong_to_joints(name: str, words: str) -> None:
-    assert readable_input(name, ["shoulder", "elbow"]) == words
+def test_a_friction_that_only_a_prior_states_is_not_printed() -> None:
+    """Standard deviations that are those of the prior, in the table and in the lists."""
+    known = RobotParameter("drive inertia", "a", 0.3, 0.04, "kg m²", True)
+    unknown = RobotParameter("drive inertia", "b", 0.4, 0.2, "kg m²", False)
+    assert _listed([known, unknown]) == "a 0.30 ± 0.04 kg m²; not determined: b"
+    assert _listed([unknown]) == "not determined"
+    assert _listed([RobotParameter("link mass·x", "a", 0.01, 0.01, "kg m", True)]) == "no change beyond 2σ"

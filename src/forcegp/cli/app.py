@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import warnings
+from functools import cache
 
 import typer
 from typer import Option
@@ -60,8 +61,9 @@ def main(program: typer.Typer = app) -> None:
     Temporary files that remain after an interrupt are removed by the next run, as after a crash.
     """
     end_when_interrupted()
+    once = cache(warn)  # several steps of a command give the same warning
     with warnings.catch_warnings():
-        warnings.showwarning = lambda message, *_, **__: warn(message)
+        warnings.showwarning = lambda message, *_, **__: once(str(message))
         try:
             program()
         except BaseException as error:

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import shutil
 import sys
 import textwrap
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
@@ -82,16 +83,40 @@ def progress_bar(description: str, total: int) -> Iterator[Advance]:
 
 
 def show(result: Mapping[str, object], as_json: bool) -> None:
-    """Print the nonempty values of a result, one per line, or print all values as JSON."""
+    """Print the nonempty values of a result, one per line, or print all values as JSON.
+
+    A unit is the last part of a name, as in `period_s`.
+    """
     if as_json:
         typer.echo(json.dumps(finite(dict(result)), default=str, allow_nan=False))
         return
-    fields = {name: value for name, value in result.items() if value is not None and value != ()}
-    width = max(len(name) for name in fields)
+    fields = {name: value for name, value in result.items() if value is not None and value not in ("", ())}
+    names = {name: re.sub(r"_(s|m)$", r" [\1]", name).replace("_", " ") for name in fields}
+    width = max(map(len, names.values()))
     for name, value in fields.items():
         text = ", ".join(map(str, value)) if isinstance(value, list | tuple) else value
         text = f"{value:.6g}" if isinstance(value, float) else text
-        say(text, f"{name.replace('_', ' '):<{width}}  ", indent=width + 2)
+        say(text, f"{names[name]:<{width}}  ", indent=width + 2)
+
+
+def rounded(value: float, std: float = math.nan) -> str:
+    """Return a value with its standard deviation, rounded to one or two digits of the latter, if known.
+
+    >>> rounded(4.2496, 0.0374), rounded(123.4, 21.0), rounded(0.012)
+    ('4.25 ± 0.04', '123 ± 21', '0.012')
+    """
+    if not (math.isfinite(std) and std > 0.0):
+        return f"{value:.3g}"
+    places = max(0, 1 - math.floor(math.log10(std / 0.355)))
+    return f"{value:.{places}f} ± {std:.{places}f}"
+
+
+def show_table(rows: Sequence[Sequence[str]]) -> None:
+    """Print rows of texts in aligned columns; the first row is the head."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    for row in rows:
+        cells = (f"{text:<{width}}" for text, width in zip(row, widths, strict=True))
+        say(Verbatim("  ".join(cells).rstrip()))
 
 
 def save(write: Callable[[Path], object], out: Path) -> None:

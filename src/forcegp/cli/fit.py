@@ -12,12 +12,14 @@ from typer import Option
 
 import forcegp
 from forcegp.cli import common, options
-from forcegp.cli.common import progress_bar, show
+from forcegp.cli.common import progress_bar, rounded, say, show, show_table
 from forcegp.errors import ParameterError
 
 if TYPE_CHECKING:
-    from forcegp.models.base import Model
+    from forcegp.models.base import FittedModel, Model
     from forcegp.models.fit_result import FitResult
+    from forcegp.models.robot_parameters import RobotParameter
+    from forcegp.models.structured_fit import StructuredFit
 
 STREAM_ROWS = 100_000
 """Number of rows above which a log is read piece by piece."""
@@ -50,6 +52,7 @@ def fit(
         Option(min=1, help="Number of processes that share the reading of a long log (needs Dask)."),
     ] = None,
     seed: Annotated[int | None, Option(help="Seed for random initial values.")] = None,
+    verbose: options.Verbose = False,
     as_json: options.AsJson = False,
 ) -> None:
     """Fit a model of the forward dynamics to logged motion.
@@ -90,47 +93,100 @@ def fit(
     doubts = () if learned.result.converged else (f"the fit did not converge: {learned.result.message}",)
     for doubt in (*doubts, *learned.result.warnings):
         common.warn(doubt)
-    result: dict[str, object] = {"model": regression.name, "training_points": len(training)}
-    joints = () if as_json else system.robot.joint_names
-    show({**result, **_figures(learned.result, joints), "file": str(model_path(out))}, as_json)
+    head: dict[str, object] = {"model": regression.name, "training_points": len(training)}
+    if as_json:
+        found = {**head, **_complete(learned)}
+    else:
+        found = {**_summary(learned, len(training)), **((head | _details(learned.result)) if verbose else {})}
+    show({**found, "file": str(model_path(out))}, as_json)
 
 
-INPUTS = {
-    "q": "position",
-    "qd": "velocity",
-    "tau": "torque",
-    "load": "gravity load",
-    "velocity": "velocity",
-    "coulomb": "direction of motion",
-}
-"""Display names of the inputs of priors and models."""
+CLEAR = 2.0
+"""Number of standard deviations from zero beyond which a parameter is listed."""
+GROUPS = ("torque scale", "torque delay", "torque offset", "drive inertia", "links", "payload")
+"""First words of the parameters that are listed together."""
+FRICTION = ("slow friction", "fast friction")
+UNITS = {"revolute": "friction and noise in N m at speeds in rad/s", "prismatic": "N at m/s if sliding"}
+"""Units of the table of friction, by type of joint."""
+NOT = "–"
+"""Mark of friction that the log does not determine."""
 
 
-def readable_input(name: str, joints: Sequence[str]) -> str:
-    """Return the name of an input of a model in words.
+def _complete(learned: FittedModel) -> dict[str, object]:
+    """Return the complete result of a fit, for programs."""
+    from forcegp.models.structured_fit import StructuredFit
 
-    >>> readable_input("joint_friction.load[0]", ["shoulder", "elbow"])
-    'gravity load of shoulder (joint_friction)'
-    """
-    head, _, number = name.removesuffix("]").partition("[")
-    prior, _, kind = head.rpartition(".")
-    word, index = INPUTS.get(kind.rstrip("_0123456789")), int(number)
-    per_joint = word and index < len(joints) and not prior.startswith("contact")
-    text = f"{word} of {joints[index]}" if per_joint else f"{word or kind}, component {index + 1}"
-    return f"{text} ({prior})" if prior else text
+    found = _numbers(learned.result)
+    if isinstance(learned, StructuredFit):
+        found["torque_noise"] = None if learned.torque_std is None else learned.torque_std.tolist()
+        found["robot_parameters"] = [vars(each) for each in learned.robot_parameters()]
+    return found
 
 
-def _figures(result: FitResult, joints: Sequence[str]) -> dict[str, object]:
-    """Return the fields of the result by name.
+def _numbers(result: FitResult) -> dict[str, object]:
+    return {name: value for name, value in asdict(result).items() if name != "history"}
 
-    If names of joints are given, the fields are texts for readers, without empty fields and printed warnings.
-    """
-    figures = {name: value for name, value in asdict(result).items() if name != "history"}
-    if not joints:
-        return figures
-    figures["worth"] = "".join(f"\n  {name}: {nats:.3g} nats" for name, nats in result.worth.items())
-    figures["constant_inputs"] = tuple(readable_input(each, joints) for each in result.constant_inputs)
-    return {name: value for name, value in figures.items() if name != "warnings" and value != ""}
+
+def _details(result: FitResult) -> dict[str, object]:
+    """Return the numbers of the computation as lines, without the warnings, which are printed before."""
+    worth = "".join(f"\n  {name}: {nats:.3g} nats" for name, nats in result.worth.items())
+    return {**_numbers(result), "worth": worth, "warnings": None}
+
+
+def _summary(learned: FittedModel, rows: int) -> dict[str, object]:
+    """Print the friction of each joint, and return the other parameters, the noise and the duration."""
+    from forcegp.models.structured_fit import StructuredFit
+    from forcegp.plots import unit
+
+    result, lines = learned.result, dict[str, object]()
+    if isinstance(learned, StructuredFit):
+        parameters = learned.robot_parameters()
+        _show_joints(learned, parameters)
+        for group in (*GROUPS, *learned.system.contact_names):
+            own = [p for p in parameters if p.of == group or p.name.startswith(group.removesuffix("s"))]
+            lines[group] = _listed(own) if own else None
+        for name, std in () if learned.torque_std is not None else learned.noise.items():
+            lines[f"noise of {name}"] = f"{float(std.mean()):.3g} {unit(name)}"
+    part = "" if result.samples in (None, rows) else f"{result.samples} rows in motion, of "
+    return {**lines, "learned_from": f"{part}{rows} rows, in {result.seconds:.2g} s"}
+
+
+def _show_joints(learned: StructuredFit, parameters: Sequence[RobotParameter]) -> None:
+    """Print a table of the friction and the torque noise of each joint."""
+    import torch
+
+    found = {(p.of, p.name): p for p in parameters if p.name in FRICTION}
+    if not found:
+        return
+    robot, noise, rows = learned.system.robot, learned.torque_std, [["joint", *FRICTION, "torque noise"]]
+    tau = torch.cat([m.tau for m in learned.training.measurements])
+    for j, joint in enumerate(robot.joint_names):
+        each = (found.get((joint, name)) for name in FRICTION)
+        cells = [f"{rounded(p.value, p.std)} at {p.speed:.2g}" if p and p.determined else NOT for p in each]
+        share = "" if noise is None else f"{float(noise[j]):.2g} ({float(noise[j] / tau[:, j].std()):.0%})"
+        rows.append([joint, *cells, share])
+    show_table(rows)
+    units = ", ".join(dict.fromkeys(UNITS[kind] for kind in robot.joint_types))
+    missing = f"; {NOT}: not determined" * any(NOT in row for row in rows)
+    say(f"{units}; ± is one σ; (%) of the torque's σ{missing}")
+
+
+def _listed(parameters: Sequence[RobotParameter]) -> str:
+    """Return the parameters that are clear, and the names of those that the log does not determine."""
+
+    def label(p: RobotParameter) -> str:
+        word = p.name.removeprefix("link ").removeprefix("payload ")
+        return f"{p.of} {word}" if word != p.name else p.of if p.name in GROUPS else p.name
+
+    known = [p for p in parameters if p.determined and abs(p.value) > CLEAR * (p.std or 0.0)]
+    texts = [f"{label(p)} {rounded(p.value, p.std)} {p.unit}".strip() for p in known]
+    links = parameters[0].name.startswith("link ")
+    # Most parameters of single links are never determined.
+    missing = [label(p) for p in parameters if not p.determined and not links]
+    if len(missing) == len(parameters):
+        return "not determined"
+    found = ", ".join(texts) or f"no{' change' if links else 'ne'} beyond {CLEAR:g}σ"
+    return f"{found}; not determined: {', '.join(missing)}" if missing else found
 
 
 def _training(

@@ -9,6 +9,7 @@ from typing import Annotated
 from typer import Option
 
 AsJson = Annotated[bool, Option("--json", help="Print the result as JSON on stdout.")]
+Verbose = Annotated[bool, Option("--verbose", help="Also print the numbers of the computation.")]
 SCENES = sorted(
     entry.name.removesuffix(".toml") for entry in (files("forcegp") / "scene" / "bundled").iterdir()
 )

@@ -355,8 +355,8 @@ def check_robot(data: Fields, robot: RobotModel) -> None:
     logged = data.header.robot_fingerprint
     if logged is not None and logged != robot.fingerprint:
         warnings.warn(
-            f"the data were logged on robot {data.header.robot!r} (fingerprint {logged}) and are used with "
-            f"{robot.name!r} ({robot.fingerprint}): inertia, kinematics, base or gravity differ",
+            f"the data were logged on robot {data.header.robot!r} and are used with {robot.name!r}: inertia, "
+            "kinematics, base or gravity differ",
             RobotMismatchWarning,
             stacklevel=3,
         )
