@@ -144,3 +144,21 @@ def test_a_finding_is_one_paragraph(folder: Path, log: Log) -> None:
     (line,) = (line for line in done.stdout.splitlines() if "torque-sign" in line)
     assert line.startswith("error: ") and log.joint_names[1] in line and "→" in line
     assert not any("50526" in line or "e+" in line for line in done.stdout.splitlines())
+
+
+def test_three_findings_come_first_and_the_others_are_counted(
+    folder: Path, log: Log, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Tables of what cannot be seen are on the page only; `--all` and JSON have everything."""
+    kinds = ("faults-hidden", "torque-gain", "torque-offset", "spike", "quantised", "impact")
+    found = tuple(Finding(kind, f"says {kind}", log.all_rows) for kind in kinds)
+    monkeypatch.setattr(checks, "check", lambda *_, **__: Report(found, len(log), log.joint_names))
+    lines = run(folder, log).stdout.splitlines()
+    assert [line.split(" → ")[0] for line in lines[:3]] == [f"warning: says {kind}" for kind in kinds[1:4]]
+    assert lines[3:] == ["also 3 notes: pass --all", "verdict: go on with care; 3 warnings to review"]
+    page = folder / "check.html"
+    assert f"also 3 notes: see {page}, or pass --all" in run(folder, log, "-o", str(page)).stdout
+    assert all(f"says {kind}" in page.read_text() for kind in kinds)
+    every = run(folder, log, "--all").stdout
+    assert all(f"says {kind}" in every for kind in kinds) and "also" not in every
+    assert len(json.loads(run(folder, log, "--json").stdout)["findings"]) == len(kinds)

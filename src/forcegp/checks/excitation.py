@@ -51,7 +51,7 @@ def check_motion(system: ConstrainedSystem, log: Log) -> Outcome:
     """Find joints that do not move or rarely change direction."""
     still = still_joints(log)
     unit = " or ".join(dict.fromkeys(position_unit(system.robot, j) for j in np.flatnonzero(still)))
-    text = f"range of {{}} below {STILL} {unit}: friction and inertia are not seen"
+    text = f"{{}}: range below {STILL} {unit}, too small to see friction and inertia"
     findings = log.on_joints("joint-still", still, text)
     if not log.header.ordered:
         return findings, log

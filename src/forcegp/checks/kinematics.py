@@ -140,8 +140,9 @@ def _late(log: Log, level: Match) -> list[Finding]:
     delay, share = np.array(pairs).T
     # A velocity from neighbouring samples, or of a semi-implicit integrator, is half a step off by itself.
     late = level.moving & (share > PROPORTIONAL) & (np.abs(delay) > HALF_STEP * log.dt)
-    shown = ", ".join(f"{1e3 * abs(x):.2g} ms {'behind' if x > 0 else 'ahead of'}" for x in delay[late])
-    text = f"qd of {{}} is {shown} the rate of change of q"
+    each = [f"{1e3 * abs(x):.2g} ms {'behind' if x > 0 else 'ahead of'}" for x in delay[late]]
+    shown = ", ".join(each if len(set(each)) > 1 else each[:1])
+    text = f"{{}}: qd is {shown} the rate of change of q"
     common = (
         bool(late.any())
         and late[level.moving].all()

@@ -235,8 +235,7 @@ def _friction(explanation: Explanation, stated: Explanation) -> list[Finding]:
             sizes, text = _stated(stated, j, float(np.sqrt((rows[:, j] ** 2).mean())))
             evidence |= {f"{kind} {log.joint_names[j]}": x for kind, x in sizes.items()}
             parts.append(f"{log.joint_names[j]} {text}")
-        what = f"{word} friction than the robot file declares"
-        text = f"joints have {what}; total (viscous, Coulomb): {'; '.join(parts)}"
+        text = f"{'; '.join(parts)}: friction, {word} than the robot file declares"
         findings += [log.finding("friction-undeclared", text, log.named(hit), **evidence)] if parts else []
     return findings
 
@@ -252,7 +251,7 @@ def _offsets(explanation: Explanation) -> list[Finding]:
     listed = ", ".join(f"{joint} {offset[j]:+.3g} {force_unit(system.robot, j)}" for j, joint in off.items())
     evidence = {f"offset {joint}": offset[j] for j, joint in off.items()}
     evidence["largest_torque"] = max(abs(offset[j]) for j in off)
-    text, names = f"the logged torque is off by a constant: {listed}", tuple(off.values())
+    text, names = f"{listed}: constant error of the logged torque", tuple(off.values())
     common = [hypotheses.common_gain_hypothesis(log, rows, explanation.problem)] if nq > 1 else []
     one_each = hypotheses.gain_hypothesis(log, rows, tuple(off))
     tried = *common, *hypotheses.robot_hypotheses(system, log, rows), one_each

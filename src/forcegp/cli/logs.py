@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -16,7 +17,7 @@ from forcegp.cli.options import AsJson, Differentiate, RobotName, SceneOrNone
 from forcegp.errors import ForceGPError
 
 if TYPE_CHECKING:
-    from forcegp.checks import Report
+    from forcegp.checks import Finding, Report
     from forcegp.data.selection import Split
     from forcegp.logs import Imported
 
@@ -152,6 +153,8 @@ def _json(imported: Imported) -> dict[str, object]:
 NOT_USABLE = 1
 """Exit code if a finding makes a fit worthless."""
 COLOURS = {"error": "red", "warning": "yellow", "note": "cyan"}
+FIRST, TABLES = 3, ("faults-hidden",)
+"""Number of findings that are printed without --all, and kinds of findings that are not, which are tables."""
 
 
 def check(
@@ -164,6 +167,7 @@ def check(
     out: Annotated[
         Path | None, Option("--out", "-o", writable=True, help="HTML page with a plot of each finding.")
     ] = None,
+    every: Annotated[bool, Option("--all", help="Print all findings, and not only the first three.")] = False,
     as_json: AsJson = False,
 ) -> None:
     """Check a log against a scene before fitting: clock, units, signs, masses, contact, noise and motion.
@@ -204,7 +208,7 @@ def check(
         if not as_json:
             if len(data) > 1:
                 say(path, "log: ", bold=True)
-            _print(report)
+            _print(report, every, out)
             if out is not None:
                 say(out, "page: ")
             say("", report.verdict, bold=True)
@@ -216,25 +220,31 @@ def check(
         raise typer.Exit(NOT_USABLE)
 
 
-def _print(report: Report) -> None:
-    """Print each finding as one paragraph that starts with its severity and joints."""
-    from forcegp.rows import describe
-
-    for finding in report.findings:
-        named = [joint for joint in finding.joints if joint not in finding.message]
-        where = (
-            "all joints: "
-            if len(named) == len(report.joint_names) > 1
-            else f"{', '.join(named)}: " * bool(named)
-        )
-        every = finding.intervals == ((0, report.samples),)
-        rows = "all rows" if every else describe(finding.intervals, most=2)
-        kinds = " or ".join(finding.kinds)
-        text = f"{where}{finding.message} → {finding.remedy} [{kinds}, {rows}]"
-        say(text, f"{finding.severity}: ", fg=COLOURS[finding.severity])
+def _print(report: Report, every: bool, page: Path | None) -> None:
+    """Print the first or all findings, one paragraph each, and count the others."""
+    texts = [finding for finding in report.findings if finding.kind not in TABLES]
+    shown = report.findings if every else texts[:FIRST]
+    for finding in shown:
+        say(_paragraph(finding, report), f"{finding.severity}: ", fg=COLOURS[finding.severity])
+    counts = Counter(finding.severity for finding in report.findings) - Counter(f.severity for f in shown)
+    if counts:
+        more = ", ".join(f"{n} {severity}{'s' * (n > 1)}" for severity, n in counts.items())
+        say(f"also {more}: {f'see {page}, or ' if page else ''}pass --all")
     for reason in dict.fromkeys(report.skipped.values()):
         names = ", ".join(name for name, why in report.skipped.items() if why == reason)
         say(f"not checked: {names} ({reason})")
+
+
+def _paragraph(finding: Finding, report: Report) -> str:
+    """Return a finding as one paragraph, which starts with its joints."""
+    from forcegp.rows import describe
+
+    named = [joint for joint in finding.joints if joint not in finding.message]
+    everywhere = len(named) == len(report.joint_names) > 1
+    where = "all joints: " if everywhere else f"{', '.join(named)}: " * bool(named)
+    part = finding.intervals != ((0, report.samples),) and describe(finding.intervals) not in finding.message
+    rows = f", {describe(finding.intervals, most=2)}" if part else ""
+    return f"{where}{finding.message} → {finding.remedy} [{' or '.join(finding.kinds)}{rows}]"
 
 
 ORDER_LOST = (
