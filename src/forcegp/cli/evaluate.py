@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from typer import Option
 
 import forcegp
-from forcegp.cli.common import fitted, model_table, progress_bar, read_data, show, warn_beyond
-from forcegp.cli.options import AsJson, Config, DataFile
+from forcegp.cli.common import fitted, model_table, progress_bar, read_data, show, show_table, warn_beyond
+from forcegp.cli.options import AsJson, Config, DataFile, Verbose
 from forcegp.errors import ForceGPError
 
 if TYPE_CHECKING:
@@ -38,6 +39,7 @@ def evaluate(
         str | None, Option("--scene", "-s", help="Scene of the model to fit, if --model is omitted.")
     ] = None,
     config: Config = None,
+    verbose: Verbose = False,
     as_json: AsJson = False,
 ) -> None:
     """Compare the predictions of a model with a data set and with trivial predictors.
@@ -45,9 +47,10 @@ def evaluate(
     The trivial predictors are the mean, the robot file alone, and a least-squares fit of inertial parameters,
     viscous and Coulomb friction, and offsets. The verdict states which fraction of the non-gravitational
     torque the model explains, and the errors in open-loop motion and, if logged, in the contact force. A
-    comparison of the model with each predictor in torque and acceleration follows. The response is the effect
-    of an added torque on each joint, which is 1 if the model has the inertia of the robot file. Errors are in
-    rad/s² (m/s² for prismatic joints). Coverage is the fraction of samples within two standard deviations.
+    comparison of the model with each predictor in torque and acceleration follows, with the torque errors by
+    joint in motion (root mean square), and the fraction of accelerations within two standard deviations. With
+    --verbose, the response is the effect of an added torque on each joint, which is 1 if the model has the
+    inertia of the robot file. Errors of accelerations are in rad/s² (m/s² for prismatic joints).
 
     With --out, the command writes a page that shows the verdict, the errors by joint, the calibration and
     the predictions over the first seconds. It prints the path of the page, and writes all scores to
@@ -71,27 +74,45 @@ def evaluate(
     with progress_bar("evaluating", len(test)) as progress:
         evaluation = forcegp.evaluate(regression, test, train=training, progress=progress)
     warn_beyond(regression, test)
-    result: dict[str, object] = {
-        "verdict": evaluation.verdict or "too few samples",
-        "doubts": evaluation.doubts,
-        "comparison": evaluation.comparison or None,
+    numbers: dict[str, object] = {
         "left_out": evaluation.left_out,
-        "response": _response(evaluation, as_json),
+        "response": evaluation.response,
         **evaluation.summary(),
     }
-    if as_json and isinstance(regression, StructuredFit):
-        result["parameters"] = [vars(each) for each in regression.parameters()]
+    head = {"verdict": evaluation.verdict or "too few samples"}
+    doubts, compared = evaluation.doubts, {"comparison": evaluation.comparison or None}
+    written: dict[str, object] = {}
     if out is not None:
         names = str(model or config or scene), str(data), str(train) if train else None
-        result |= _written(out, evaluation, regression, test, names)
-    show(result, as_json)
+        written = _written(out, evaluation, regression, test, names)
+    if as_json:
+        result = {**head, "doubts": doubts, **compared, **numbers}
+        if isinstance(regression, StructuredFit):
+            result["parameters"] = [vars(each) for each in regression.parameters()]
+        show(result | written, as_json)
+        return
+    show({**head, **{f"doubt_{i + 1}": text for i, text in enumerate(doubts)}, **compared}, as_json)
+    _show_errors(evaluation)
+    if evaluation.response is not None:
+        each = zip(evaluation.joint_names, evaluation.response, strict=True)
+        numbers["response"] = [f"{joint} {x:.2g}" for joint, x in each]
+    show({**(numbers if verbose else {"samples": evaluation.samples}), **written}, as_json)
 
 
-def _response(scores: forcegp.evaluation.Evaluation, as_json: bool) -> object:
-    """Return the effect of an added torque by joint, as numbers for JSON or as text."""
-    if scores.response is None or as_json:
-        return scores.response
-    return [f"{joint} {x:.2g}" for joint, x in zip(scores.joint_names, scores.response, strict=True)]
+def _show_errors(scores: forcegp.evaluation.Evaluation) -> None:
+    """Print a table of the torque errors of the model and of the trivial predictors, and of the coverage."""
+    if not scores.predictors:
+        return
+    columns: dict[str, Sequence[float | None]] = {p.name: p.torque.in_motion for p in scores.predictors}
+    rows = [["torque error [N m, N]", *columns]]
+    rows += [
+        [joint, *("" if x is None else f"{x:.3g}" for x in errors)]
+        for joint, *errors in zip(scores.joint_names, *columns.values(), strict=True)
+    ]
+    if scores.uncertainty is not None:
+        shares = (f"{share:.0%}" for share in scores.uncertainty.coverage_by_joint)
+        rows = [[*row, text] for row, text in zip(rows, ("within ±2σ (95%)", *shares), strict=True)]
+    show_table(rows)
 
 
 def _written(
