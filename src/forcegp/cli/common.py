@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import re
 import shutil
 import sys
 import textwrap
@@ -83,20 +82,33 @@ def progress_bar(description: str, total: int) -> Iterator[Advance]:
 
 
 def show(result: Mapping[str, object], as_json: bool) -> None:
-    """Print the nonempty values of a result, one per line, or print all values as JSON.
-
-    A unit is the last part of a name, as in `period_s`.
-    """
+    """Print the nonempty values of a result, one per line, or print all values as JSON."""
     if as_json:
         typer.echo(json.dumps(finite(dict(result)), default=str, allow_nan=False))
         return
     fields = {name: value for name, value in result.items() if value is not None and value not in ("", ())}
-    names = {name: re.sub(r"_(s|m)$", r" [\1]", name).replace("_", " ") for name in fields}
+    names = {name: named(name) for name in fields}
     width = max(map(len, names.values()))
     for name, value in fields.items():
         text = ", ".join(map(str, value)) if isinstance(value, list | tuple) else value
         text = f"{value:.6g}" if isinstance(value, float) else text
         say(text, f"{names[name]:<{width}}  ", indent=width + 2)
+
+
+UNITS = {"rad_s2": "rad/s²", "m_s": "m/s", "Nm": "N m", "N": "N", "m": "m", "s": "s"}
+"""Units at the end of names of fields."""
+
+
+def named(name: str) -> str:
+    """Return the name of a field in words, with its unit in brackets.
+
+    >>> named("tool_speed_m_s"), named("training_points")
+    ('tool speed [m/s]', 'training points')
+    """
+    for end, unit in UNITS.items():
+        if name.endswith(f"_{end}"):
+            return f"{name.removesuffix(f'_{end}').replace('_', ' ')} [{unit}]"
+    return name.replace("_", " ")
 
 
 def rounded(value: float, std: float = math.nan) -> str:

@@ -295,6 +295,7 @@ def select(
     forcegp select run.csv -n 400 --split stretches --differentiate 11 -o train.parquet --rest test.parquet
     """
     from forcegp.data import split_by_selection, split_by_stretches, without_marked_impacts
+    from forcegp.rows import describe
 
     for path in (out, rest):
         if path is not None:
@@ -309,6 +310,9 @@ def select(
             parts = split_by_stretches(data, count, **held_out, method=method, seed=seed, progress=progress)
     how = f"of {len(data)} rows by {method} points, split by {split}, seed {seed}"
     result = _written(data, parts, how, out, rest)
+    if parts.stretches:
+        rows = [list(rows) for rows in parts.stretches]
+        result["held_out_rows"] = rows if as_json else describe(tuple(parts.stretches)).split(" ", 1)[1]
     if method == "random":
         result["note"] = ORDER_LOST
     if len(data) < len(whole):
@@ -328,8 +332,6 @@ def _written(
             points = _split_at_gaps(data[rows]) if parts.stretches and kind == "test" else data[rows]
             save(points.with_step(step).write, path)
             result |= {f"{kind}_points": len(rows), f"{kind}_file": str(path)}
-    if parts.stretches:
-        result["held_out_rows"] = [list(rows) for rows in parts.stretches]
     return result
 
 

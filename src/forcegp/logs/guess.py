@@ -272,9 +272,10 @@ def _torque(draft: Draft, trial: Signals, system: ConstrainedSystem) -> None:
         lighter, follows = (x[own] for x in torque_slopes(trial, system, "gravity"))
         if (np.abs(follows) > 0.5).sum() >= min(clear.sum(), 0.5 * measured):
             slopes, clear, family.compensated = lighter, np.abs(follows) > 0.5, "gravity"
-            draft.say(
-                "torque", f"{share:.0%} of gravity is in it: the driver seems to subtract it", doubt=True
+            text = (
+                f"the torque has {max(share, 0.0):.0%} of the gravity load: the driver seems to subtract it"
             )
+            draft.say("torque", text, doubt=True)
     if clear.sum() < 0.5 * measured:
         return _remainder(draft, trial, correlation)
     family.sign = _signs(slopes, clear, joints)
