@@ -111,13 +111,13 @@ def named(name: str) -> str:
     return name.replace("_", " ")
 
 
-def rounded(value: float, std: float = math.nan) -> str:
+def rounded(value: float, std: float | None = None) -> str:
     """Return a value with its standard deviation, rounded to one or two digits of the latter, if known.
 
     >>> rounded(4.2496, 0.0374), rounded(123.4, 21.0), rounded(0.012)
     ('4.25 ± 0.04', '123 ± 21', '0.012')
     """
-    if not (math.isfinite(std) and std > 0.0):
+    if std is None or not (math.isfinite(std) and std > 0.0):
         return f"{value:.3g}"
     places = max(0, 1 - math.floor(math.log10(std / 0.355)))
     return f"{value:.{places}f} ± {std:.{places}f}"

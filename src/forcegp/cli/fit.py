@@ -93,11 +93,11 @@ def fit(
     doubts = () if learned.result.converged else (f"the fit did not converge: {learned.result.message}",)
     for doubt in (*doubts, *learned.result.warnings):
         common.warn(doubt)
-    head: dict[str, object] = {"model": regression.name, "training_points": len(training)}
     if as_json:
-        found = {**head, **_complete(learned)}
+        found = {"model": regression.name, "training_points": len(training), **_complete(learned)}
     else:
-        found = {**_summary(learned, len(training)), **((head | _details(learned.result)) if verbose else {})}
+        found = _summary(learned, regression.name, len(training))
+        found |= _details(learned.result) if verbose else {}
     show({**found, "file": str(model_path(out))}, as_json)
 
 
@@ -133,22 +133,27 @@ def _details(result: FitResult) -> dict[str, object]:
     return {**_numbers(result), "worth": worth, "warnings": None}
 
 
-def _summary(learned: FittedModel, rows: int) -> dict[str, object]:
+def _summary(learned: FittedModel, name: str, rows: int) -> dict[str, object]:
     """Print the friction of each joint, and return the other parameters, the noise and the duration."""
     from forcegp.models.structured_fit import StructuredFit
     from forcegp.plots import unit
 
-    result, lines = learned.result, dict[str, object]()
+    result = learned.result
+    part = "" if result.samples in (None, rows) else f"{result.samples} rows in motion, of "
+    lines: dict[str, object] = {"model": f"{name}, learned from {part}{rows} rows in {result.seconds:.2g} s"}
     if isinstance(learned, StructuredFit):
         parameters = learned.robot_parameters()
         _show_joints(learned, parameters)
         for group in (*GROUPS, *learned.system.contact_names):
             own = [p for p in parameters if p.of == group or p.name.startswith(group.removesuffix("s"))]
             lines[group] = _listed(own) if own else None
-        for name, std in () if learned.torque_std is not None else learned.noise.items():
-            lines[f"noise of {name}"] = f"{float(std.mean()):.3g} {unit(name)}"
-    part = "" if result.samples in (None, rows) else f"{result.samples} rows in motion, of "
-    return {**lines, "learned_from": f"{part}{rows} rows, in {result.seconds:.2g} s"}
+        if not parameters:
+            lines["forces"] = ", ".join(prior.name for prior in learned.force_priors)
+        kinds = learned.system.robot.joint_types
+        for quantity, std in learned.noise.items():
+            size = float(std.mean())
+            lines[f"noise of {quantity}"] = f"{size:.3g} {unit(quantity, kinds)}" if size > 0.0 else None
+    return lines
 
 
 def _show_joints(learned: StructuredFit, parameters: Sequence[RobotParameter]) -> None:
@@ -161,10 +166,13 @@ def _show_joints(learned: StructuredFit, parameters: Sequence[RobotParameter]) -
     robot, noise, rows = learned.system.robot, learned.torque_std, [["joint", *FRICTION, "torque noise"]]
     tau = torch.cat([m.tau for m in learned.training.measurements])
     for j, joint in enumerate(robot.joint_names):
+        if not bool(robot.driven[j]):
+            continue
         each = (found.get((joint, name)) for name in FRICTION)
         cells = [f"{rounded(p.value, p.std)} at {p.speed:.2g}" if p and p.determined else NOT for p in each]
-        share = "" if noise is None else f"{float(noise[j]):.2g} ({float(noise[j] / tau[:, j].std()):.0%})"
-        rows.append([joint, *cells, share])
+        size = "" if noise is None else f"{float(noise[j]):.2g}"
+        share = f" ({float(noise[j] / tau[:, j].std()):.0%})" if noise is not None and tau[:, j].any() else ""
+        rows.append([joint, *cells, f"{size}{share}"])
     show_table(rows)
     units = ", ".join(dict.fromkeys(UNITS[kind] for kind in robot.joint_types))
     missing = f"; {NOT}: not determined" * any(NOT in row for row in rows)
