@@ -103,7 +103,7 @@ def fit(
 
 CLEAR = 2.0
 """Number of standard deviations from zero beyond which a parameter is listed."""
-GROUPS = ("torque scale", "torque delay", "torque offset", "drive inertia", "links", "payload")
+GROUPS = ("torque scale", "torque delay", "torque offset", "drive inertia", "link", "payload")
 """First words of the parameters that are listed together."""
 FRICTION = ("slow friction", "fast friction")
 UNITS = {"revolute": "friction and noise in N m at speeds in rad/s", "prismatic": "N at m/s if sliding"}
@@ -144,9 +144,11 @@ def _summary(learned: FittedModel, name: str, rows: int) -> dict[str, object]:
     if isinstance(learned, StructuredFit):
         parameters = learned.robot_parameters()
         _show_joints(learned, parameters)
-        for group in (*GROUPS, *learned.system.contact_names):
-            own = [p for p in parameters if p.of == group or p.name.startswith(group.removesuffix("s"))]
-            lines[group] = _listed(own) if own else None
+        groups = {group: [p for p in parameters if p.name.startswith(group)] for group in GROUPS}
+        others = [p for p in parameters if not p.name.startswith((*GROUPS, *FRICTION))]
+        for contact in learned.system.contact_names:
+            groups[f"contact {contact}"] = [p for p in others if p.of == contact]
+        lines |= {group: _listed(own) for group, own in groups.items() if own}
         if not parameters:
             lines["forces"] = ", ".join(prior.name for prior in learned.force_priors)
         kinds = learned.system.robot.joint_types

@@ -118,32 +118,35 @@ def _of_joints(
     weights: _Weights, posterior: ForcePosterior, system: ConstrainedSystem, states: Sequence[States]
 ) -> Iterator[RobotParameter]:
     """Yield the friction of each joint that moves both ways, and the offset of its torque."""
-    parts, Phi = weights.latent.basis.parts, []
+    parts = weights.latent.basis.parts
     blocks = [posterior.rows(system, at, affine_map(system, at, "joint_friction")) for at in states]
-    for block in blocks:
-        each = zip(parts, block.operators, block.features, strict=True)
-        rows = torch.cat([part.rows(W, part.values(x)[0]) for part, W, x in each], dim=-1)
-        Phi.append(rows.unflatten(0, block.target.shape))
-    # −Q_D − Φ w
-    Phi, known = -torch.cat(Phi), -torch.cat([block.target for block in blocks])
-    qd = torch.cat([at.qd for at in states])
+    values = [[part.values(x)[0] for part, x in zip(parts, b.features, strict=True)] for b in blocks]
+    qd, Q_D = torch.cat([at.qd for at in states]), torch.cat([block.target for block in blocks])
+
+    def columns(j: int) -> Tensor:
+        """Return Φ of joint j, `(n, size)`."""
+        each = (zip(parts, b.operators, V, strict=True) for b, V in zip(blocks, values, strict=True))
+        return torch.cat([torch.cat([p.rows(W[:, j : j + 1], V) for p, W, V in b], dim=-1) for b in each])
+
     for j, joint in enumerate(system.robot.joint_names):
         unit = "N m" if system.robot.joint_types[j] == "revolute" else "N"
         v, size = qd[:, j], qd[:, j].abs()
         moves = size > SLOWEST * size.max()
         if not bool(system.robot.driven[j]) or not bool(moves.any()):
             continue
+        # −Q = −Q_D − Φ w
+        known, Phi = -Q_D[:, j], -columns(j)
         for name, band in BANDS.items():
             low, high = size[moves].quantile(torch.tensor(band).to(size))
             within = moves & (size >= low) & (size <= high)
             ahead, back = within & (v > 0.0), within & (v < 0.0)
             if min(int(ahead.sum()), int(back.sum())) >= FEWEST:
-                K, own = (0.5 * (x[ahead, j].mean(0) - x[back, j].mean(0)) for x in (Phi, known))
+                K, own = (0.5 * (x[ahead].mean(0) - x[back].mean(0)) for x in (Phi, known))
                 value, std, determined = weights.estimate(K, float(own))
                 speed = 0.5 * float(size[ahead].mean() + size[back].mean())
                 yield RobotParameter(name, joint, value, std, unit, determined, speed)
         P = torch.linalg.pinv(torch.stack([v, v.sign(), torch.ones_like(v)], dim=-1)[moves])[2]
-        value, std, determined = weights.estimate(P @ Phi[moves, j], float(P @ known[moves, j]))
+        value, std, determined = weights.estimate(P @ Phi[moves], float(P @ known[moves]))
         yield RobotParameter("torque offset", joint, value, std, unit, determined)
 
 
