@@ -11,6 +11,7 @@ import torch
 
 import forcegp
 from forcegp.errors import DataError, MappingError
+from forcegp.logs import closed as states
 from forcegp.logs import contact, import_log, parse_mapping
 from forcegp.logs.mapping import ContactStateSection
 from forcegp.logs.surface_fit import fit_surface
@@ -86,7 +87,7 @@ def test_the_multiplier_is_the_force_along_the_normal(
     pressed: tuple[forcegp.ConstrainedSystem, Signals, np.ndarray],
 ) -> None:
     system, signals, closed = pressed
-    estimate = contact.multiplier(signals, system, system.contacts[0])  # type: ignore[arg-type]
+    estimate = contact.multipliers(signals, system)["table"][:, 0]
     truth = np.where(closed, 20.0 + 5.0 * np.sin(2.0 * signals.t), 0.0)
     # The noise of the torque, 0.05 N m on levers of about half a metre, is below 1 N.
     assert np.abs(estimate - truth).std() < 1.0 and abs((estimate - truth).mean()) < 0.1
@@ -112,7 +113,48 @@ def test_the_distance_shows_the_intervals(
 def test_one_state_only_is_not_split_in_two() -> None:
     noise = np.random.default_rng(0).standard_normal(2000)
     with pytest.raises(DataError, match=r"does not determine when contact 'table'(?s:.*)always, never"):
-        contact.force_levels(noise, "table", ContactStateSection(source="wrench"))
+        states.force_levels(noise, "table", ContactStateSection(source="wrench"))
+
+
+def gait(friction: float, seed: int = 0) -> tuple[Signals, np.ndarray, np.ndarray, np.ndarray]:
+    """λ, c and ċ of a foot that stands for 0.3 of 0.5 s on a floor that is 5 mm off and drifts.
+
+    λ rises to 12 N and falls to 1 N at lift-off. Joint friction changes it with the direction of motion.
+    """
+    random, t = np.random.default_rng(seed), 0.002 * np.arange(10000)
+    phase = t % 0.5
+    closed, swing = phase < 0.3, np.clip((phase - 0.3) / 0.2, 0.0, 1.0)
+    height = 0.02 * np.sin(np.pi * swing) ** 2
+    speed = np.gradient(height, 0.002) + 0.01 * random.standard_normal(len(t))
+    load = np.where(closed, 1.0 + 11.0 * np.sin(np.pi * np.minimum(phase / 0.3, 1.0)) ** 0.5, 0.0)
+    load += friction * np.where(closed, 1.0, np.cos(np.pi * swing) * -1.0) + 0.1 * random.standard_normal(
+        len(t)
+    )
+    c = height + 5e-3 + 2e-3 * np.sin(t) + 1e-4 * random.standard_normal(len(t))
+    return (
+        Signals(("a",), t, np.arange(len(t)), np.zeros(len(t), np.int64), {}),
+        load,
+        np.stack([c, speed], 1),
+        closed,
+    )
+
+
+def test_the_motion_finds_the_ends_of_contacts_that_friction_blurs() -> None:
+    signals, load, moves, closed = gait(friction=3.0)
+    section = ContactStateSection(source="multiplier")
+    with pytest.raises(DataError, match="does not determine"):
+        states.force_levels(load, "foot", section)
+    found, high, low, source = states.closed_by_force(signals, load, "foot", section, moves)
+    assert source == "multiplier and motion" and low < 0.0 < high
+    ends, own = (np.flatnonzero(np.diff(x)) for x in (closed, found))
+    assert len(ends) == len(own) and np.abs(ends - own).max() <= 5, "10 ms"
+
+
+def test_motion_is_not_used_where_it_does_not_depend_on_the_force() -> None:
+    signals, load, moves, _ = gait(friction=3.0)
+    moves[:, 1] = np.random.default_rng(1).standard_normal(len(load))
+    with pytest.raises(DataError, match="does not determine when contact 'foot' is closed"):
+        states.closed_by_force(signals, load, "foot", ContactStateSection(source="multiplier"), moves)
 
 
 def test_short_intervals_take_the_state_around_them() -> None:
@@ -120,7 +162,7 @@ def test_short_intervals_take_the_state_around_them() -> None:
     closed = (t > 0.3) & (t < 0.7)
     closed[[10, 50]] ^= True
     signals = Signals(("a",), t, np.arange(100), np.zeros(100, np.int64), {})
-    assert contact._merge_short(closed, signals, 0.05) == 2
+    assert states.merge_short(closed, signals, 0.05) == 2
     np.testing.assert_array_equal(closed, (t > 0.3) & (t < 0.7))
 
 
@@ -131,7 +173,7 @@ def test_a_contact_that_flickers_is_not_inverted() -> None:
     closed = np.zeros(60, dtype=np.bool_)
     closed[10:50] = True
     closed[[20, 22, 23, 25, 27]] = False
-    contact._merge_short(closed, signals, 0.05)
+    states.merge_short(closed, signals, 0.05)
     assert closed[10:50].all() and not closed[:10].any() and not closed[50:].any()
 
 
@@ -153,11 +195,11 @@ def test_what_is_not_said_of_a_contact_is_an_error(
 def test_the_tip_coming_near_is_not_taken_for_contact() -> None:
     random = np.random.default_rng(0)
     closed, near = -8e-5 + 1e-5 * random.standard_normal(500), np.linspace(1e-4, 5e-2, 400)
-    threshold = contact.touching(np.concatenate([closed, near]))
+    threshold = states.touching(np.concatenate([closed, near]))
     assert closed.max() < threshold < near.min()
     # A surface that is known to a millimetre only: nothing nearer than that tells the two apart.
-    assert contact.touching(random.uniform(-3e-3, 3e-3, 500)) == contact.TOUCHING
-    assert contact.touching(near + 1.0) == contact.TOUCHING
+    assert states.touching(random.uniform(-3e-3, 3e-3, 500)) == states.TOUCHING
+    assert states.touching(near + 1.0) == states.TOUCHING
 
 
 SLIDING = (

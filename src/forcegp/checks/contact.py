@@ -14,7 +14,8 @@ from forcegp.checks.finding import Finding, with_alternatives
 from forcegp.checks.fit import BLOCKS, CHUNK, blocks_of, labelled_contacts, residual
 from forcegp.checks.log import Array, Log, Outcome, evenly
 from forcegp.constraints import ConstrainedSystem, Plane, SurfaceContact
-from forcegp.logs.contact import LEVEL, TOUCHING
+from forcegp.logs.closed import TOUCHING
+from forcegp.logs.contact import LEVEL
 from forcegp.robust import level_of, robust_std
 from forcegp.rows import Intervals, describe, intervals
 

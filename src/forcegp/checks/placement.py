@@ -18,7 +18,8 @@ from forcegp.checks.fit import cross_validate, labelled_contacts
 from forcegp.checks.hypotheses import Hypothesis, corrected, discrete, unchanged
 from forcegp.checks.log import Log, Outcome, displacement, evenly
 from forcegp.constraints import ConstrainedSystem, SurfaceContact
-from forcegp.logs.contact import LEVEL, TOUCHING, TRIED_ROWS, exchanged_joints
+from forcegp.logs.closed import TOUCHING
+from forcegp.logs.contact import LEVEL, TRIED_ROWS, exchanged_joints
 from forcegp.robot.model import RobotModel
 from forcegp.robust import level_of, robust_std
 

@@ -1,4 +1,4 @@
-"""Detection of closed contacts from the distance to the surface, a measured force, or λ.
+"""Detection of closed contacts from the distance to the surface, a measured force, or λ and the motion.
 
 The reading of a force-torque sensor is converted to the force and moment that the environment exerts at the
 contact, in world coordinates. The sensor has position p_S and rotation R in the world. Its reading f, m is
@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from itertools import combinations, pairwise
+from itertools import combinations
 
 import numpy as np
 import torch
@@ -24,11 +24,11 @@ from scipy.spatial.transform import Rotation
 from forcegp import kinematics
 from forcegp.constraints import ConstrainedSystem, SurfaceContact
 from forcegp.errors import DataError
+from forcegp.logs.closed import TOUCHING, closed_by_force, hysteresis, merge_short, touching
 from forcegp.logs.mapping import GROUND, ContactStateSection, Mapping
 from forcegp.logs.table import Array, ImportReport, Signals
 from forcegp.robot import RobotModel
 from forcegp.robust import level_and_spread, level_of
-from forcegp.rows import runs
 
 CHUNK = 1 << 12
 """Number of rows processed at a time."""
@@ -89,22 +89,28 @@ def per_contact(signals: Signals, system: ConstrainedSystem, mapping: Mapping) -
     return {"F_sensor": dict.fromkeys(names, values[:, 0]), "M_sensor": moments}
 
 
-def multiplier(signals: Signals, system: ConstrainedSystem, contact: SurfaceContact) -> Array:
-    """Return λ = (A M⁻¹Aᵀ)⁺ A (q̈ − M⁻¹Q) `(n,)` at a contact [N]. In free motion, λ is close to zero."""
-    alone = ConstrainedSystem(system.robot, [contact])
+def multipliers(signals: Signals, system: ConstrainedSystem, without: Sequence[str] = ()) -> dict[str, Array]:
+    """Return λ [N], c [m] and ċ [m/s] `(n, 3)` of each contact with a surface, apart from those in `without`.
+
+    λ = (A M⁻¹Aᵀ)⁺ A (q̈ − M⁻¹Q) holds with all contacts closed at once, and is close to zero for open ones.
+    With A of a single contact, forces of the other feet of a robot would count as forces of this one.
+    """
+    closed = ConstrainedSystem(system.robot, [c for c in system.contacts if c.name not in without])
 
     def value(q: torch.Tensor, qd: torch.Tensor, qdd: torch.Tensor, tau: torch.Tensor) -> torch.Tensor:
-        eom = alone.equations(q, qd)
+        eom = closed.equations(q, qd)
         rest = qdd - eom.free_acceleration(eom.Q_K + tau)
-        return (eom.constraint_inertia @ (eom.A @ rest[..., None]))[:, 0, 0]
+        return torch.stack([(eom.constraint_inertia @ (eom.A @ rest[..., None]))[..., 0], eom.c, eom.cd], 1)
 
-    return _rowwise(signals, ("q", "qd", "qdd", "tau"), value)
+    values = _rowwise(signals, ("q", "qd", "qdd", "tau"), value)
+    touching = [c.name for c in closed.contacts if isinstance(c, SurfaceContact)]
+    return {name: values[:, :, closed.rows[name].start] for name in touching}
 
 
 def _evidence(
     signals: Signals, system: ConstrainedSystem, mapping: Mapping, contact: SurfaceContact, source: str
 ) -> Array:
-    """Return the signal (n,) for detecting a contact: c(q) [m], the measured n·F [N], or λ [N]."""
+    """Return the signal (n,) for detecting a contact: c(q) [m], or the measured n·F [N]."""
 
     def normal_force(q: torch.Tensor, reading: torch.Tensor) -> torch.Tensor:
         force = _wrench(system.robot, mapping, q, reading)[0]
@@ -112,17 +118,9 @@ def _evidence(
 
     if source == "distance":
         return _rowwise(signals, ("q",), lambda q: contact.center_surface.value(_tip(system, contact, q)))
-    if source == "wrench":
-        return _rowwise(signals, ("q", "wrench"), normal_force)
-    return multiplier(signals, system, contact)
+    return _rowwise(signals, ("q", "wrench"), normal_force)
 
 
-SEPARATION, RELEASE_STD, RELEASE = 6.0, 4.0, 0.01
-"""Minimum difference between the force levels of open and closed contact, in standard deviations of the open
-level. Minimum margin above the open level in closed intervals, in the same unit and as a fraction of it."""
-TOUCHING, DISTANCE_STD, SMALLEST_DISTANCE = 1e-3, 6.0, 1e-6
-"""Largest distance in contact [m]; margin above the median distance in contact, in standard deviations;
-smallest margin, to allow for rounding [m]. A mapping may override the result."""
 TOUCHED, LEVEL, INSIDE = 0.02, 0.2, 0.95
 """Fraction of rows on the surface above which the surface is where the scene states. Fractions of moving rows
 at a common distance, and of rows inside the solid, above which the surface is elsewhere."""
@@ -183,7 +181,10 @@ def detect(
         if name not in system.contact_names:
             listing = ", ".join(system.contact_names) or "no contacts"
             raise mapping.error(("contact", name), f"the scene has no contact {name!r}", listing)
-    evidence, states = [], {}
+    evidence, states, forces = [], {}, {}
+    if any(section.source == "multiplier" for section in sections.values()):
+        never = [name for name, section in sections.items() if section.source == "never"]
+        forces = multipliers(signals, system, never)
     for contact in system.contacts:
         name = contact.name
         if name not in sections:
@@ -199,13 +200,17 @@ def detect(
             text = "only a contact with a surface can be detected"
             raise mapping.error(("contact", name, "source"), text, "column, always or never")
         else:
-            values = _evidence(signals, system, mapping, contact, source)
+            moves = None
+            if source == "multiplier":
+                values, moves = forces[name][:, 0], forces[name][:, 1:]
+            else:
+                values = _evidence(signals, system, mapping, contact, source)
             touches = np.abs(values) <= (sections[name].threshold or TOUCHING)
             if source == "distance" and len(values) > 1 and touches.mean() <= TOUCHED:
                 shift, text = _misplaced(signals, system, contact, values, displaced)
                 values = values - shift
                 report.find("contact", text)
-            states[name], detection = _detect(signals, values, name, sections[name])
+            states[name], detection = _detect(signals, values, name, sections[name], moves)
             evidence.append(detection)
             report.find("contact", detection.sentence(), signals.row[states[name]])
             if detection.merged:
@@ -251,95 +256,17 @@ def exchanged_joints(system: ConstrainedSystem, contact: SurfaceContact, q: Arra
 
 
 def _detect(
-    signals: Signals, values: Array, name: str, section: ContactStateSection
+    signals: Signals, values: Array, name: str, section: ContactStateSection, moves: Array | None
 ) -> tuple[NDArray[np.bool_], Evidence]:
-    if section.source == "distance":
+    source = section.source
+    if source == "distance":
         high = section.threshold or touching(values)
         low, below = section.release or high, section.threshold or TOUCHING
         closed = hysteresis(-values, -high, -low, signals.segment) & (values >= -below)
     else:
-        high, low = force_levels(values, name, section)
-        closed = hysteresis(values, high, low, signals.segment)
-    merged = _merge_short(closed, signals, section.shortest)
+        closed, high, low, source = closed_by_force(signals, values, name, section, moves)
+    merged = merge_short(closed, signals, section.shortest)
     level = {state: level_and_spread(values[closed == state]) for state in (True, False)}
     spans = [rows for rows in signals.runs(closed) if closed[rows.start]]
     times = tuple((float(signals.t[s.start]), float(signals.t[s.stop - 1])) for s in spans)
-    return closed, Evidence(name, section.source, high, low, *level[True], *level[False], times, merged)
-
-
-def touching(distance: Array) -> float:
-    """Return the distance up to which a contact counts as closed [m], at most `TOUCHING`.
-
-    Most rows within `TOUCHING` belong to the closed contact. The threshold is their median plus
-    `DISTANCE_STD` standard deviations, which separates them from approach and departure.
-
-    >>> touching(np.array([0.0, 0.001, -0.001, 0.0, 0.002, 0.9, 30.0]) * 1e-3) < 1e-5
-    True
-    """
-    near = distance[np.abs(distance) <= TOUCHING]
-    if not len(near):
-        return TOUCHING
-    level, spread = level_and_spread(near)
-    return min(TOUCHING, level + max(DISTANCE_STD * spread, SMALLEST_DISTANCE))
-
-
-def force_levels(values: Array, name: str, section: ContactStateSection) -> tuple[float, float]:
-    """Return the force above which a contact is closed, and the lower force to which intervals extend [N].
-
-    The first force separates the values into the two groups with the least variance (Otsu 1979). The second
-    exceeds the median of the open group by `RELEASE_STD` standard deviations, or by a fraction `RELEASE` of
-    the difference if that is larger. Raise `DataError` if the groups are not distinct.
-    """
-    if section.threshold is not None:
-        return section.threshold, section.release or 0.5 * section.threshold
-    counts, edges = np.histogram(values, bins=512)
-    centers = 0.5 * (edges[1:] + edges[:-1])
-    below, sums = np.cumsum(counts), np.cumsum(counts * centers)
-    above = below[-1] - below
-    with np.errstate(divide="ignore", invalid="ignore"):
-        between = below * above * (sums / below - (sums[-1] - sums) / above) ** 2
-    high = float(edges[1:][int(np.nanargmax(between[:-1]))])
-    open_level, open_spread = level_and_spread(values[values <= high])
-    closed_level, _ = level_and_spread(values[values > high])
-    if not closed_level - open_level > SEPARATION * open_spread:
-        raise DataError(
-            f"the {section.source} does not determine when contact {name!r} is closed",
-            expected=f"two levels at least {SEPARATION:g} standard deviations apart",
-            got=f"{open_level:.3g} ± {open_spread:.2g} N and {closed_level:.3g} N",
-            hint=f"set threshold under [contact.{name}], or source to always, never or distance",
-        )
-    away = max(RELEASE_STD * open_spread, RELEASE * (closed_level - open_level))
-    return high, min(section.release or open_level + away, high)
-
-
-def hysteresis(values: Array, high: float, low: float, segment: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Return the mask of all runs above `low` that reach `high`.
-
-    >>> hysteresis(np.array([0.0, 2, 5, 2, 0, 2, 0]), 4.0, 1.0, np.zeros(7, dtype=np.int64)).astype(int)
-    array([0, 1, 1, 1, 0, 0, 0])
-    """
-    result = values >= low
-    for rows in runs(segment, result):
-        result[rows] &= (values[rows] >= high).any()
-    return result
-
-
-def _merge_short(closed: NDArray[np.bool_], signals: Signals, shortest: float) -> int:
-    """Merge intervals shorter than `shortest` [s] with their neighbours, and return how many were merged.
-
-    The shortest interval is merged first, and of equal ones that with the longest neighbours.
-    """
-    count = 0
-    for trajectory in signals.runs():
-        t, state = signals.t[trajectory], closed[trajectory]
-        bounds = np.concatenate([[0], np.flatnonzero(np.diff(state)) + 1, [len(state)]])
-        while len(bounds) > 3:
-            length = t[bounds[1:] - 1] - t[bounds[:-1]]
-            own, around = length[1:-1], length[:-2] + length[2:]
-            i = int(np.lexsort((-around, own))[0])
-            if own[i] >= shortest:
-                break
-            bounds, count = np.delete(bounds, [i + 1, i + 2]), count + 1
-        for start, stop in pairwise(bounds):
-            state[start:stop] = state[start]
-    return count
+    return closed, Evidence(name, source, high, low, *level[True], *level[False], times, merged)

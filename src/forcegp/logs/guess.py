@@ -24,8 +24,9 @@ from forcegp.guards import foreign
 from forcegp.logs import units
 from forcegp.logs.base import add_imu
 from forcegp.logs.clock import even_clock
+from forcegp.logs.closed import closed_by_force
 from forcegp.logs.compensated import restore, subtracted
-from forcegp.logs.contact import force_levels, multiplier
+from forcegp.logs.contact import multipliers
 from forcegp.logs.gather import gather
 from forcegp.logs.headings import find_base, find_families, find_time, find_wrench, tokens
 from forcegp.logs.mapping import (
@@ -371,6 +372,7 @@ def propose_contacts(
     named = [(c, x) for s in log.streams for c, x in s.columns.items() if "contact" in c.lower()]
     flags = [name for name, x in named if np.isin(x, (0.0, 1.0)).all()]
     in_order = flags if len(system.contacts) in (1, len(flags)) else []
+    forces = cache(lambda: multipliers(signals(), system))
     for number, contact in enumerate(system.contacts):
         name, table = contact.name, f"contact.{quoted(contact.name)}"
         column = next((c for c in flags if name in c), next(iter(in_order[number:]), None))
@@ -381,18 +383,20 @@ def propose_contacts(
         elif "wrench" in draft.further or not isinstance(contact, SurfaceContact):
             draft.further[table] = {"source": "wrench" if "wrench" in draft.further else "always"}
         else:
-            source, reason = _state(multiplier(signals(), system, contact), name)
+            source, reason = _state(signals(), forces()[name], name)
             draft.further[table] = {"source": source}
             draft.say(table, f"no contact column; {reason}", doubt=True)
             draft.say(table, "source may also be multiplier, distance, always or never")
 
 
-def _state(values: Array, name: str) -> tuple[str, str]:
-    """Return the source of a contact's state according to λ of the rigid-body model, and the reason."""
-    middle, spread = level_and_spread(values)
+def _state(signals: Signals, values: Array, name: str) -> tuple[str, str]:
+    """Return the source of a contact's state according to λ and the motion (n, 3), and the reason."""
+    force, section = values[:, 0], ContactStateSection(source="multiplier")
+    middle, spread = level_and_spread(force)
     try:
-        high, low = force_levels(values, name, ContactStateSection(source="multiplier"))
+        _, high, low, source = closed_by_force(signals, force, name, section, values[:, 1:])
     except DataError:
         source = "always" if middle > max(2.0 * spread, LEAST_FORCE) else "never"
         return source, f"λ of the rigid body shows one state, {middle:.3g} ± {spread:.2g} N"
-    return "multiplier", f"λ of the rigid body shows two states, parted at {low:.3g} to {high:.3g} N"
+    also = source.removeprefix("multiplier")
+    return "multiplier", f"λ of the rigid body{also} shows two states, parted at {low:.3g} to {high:.3g} N"
