@@ -37,7 +37,7 @@ from forcegp.models.prediction import CHUNK, Prediction
 
 METHODS = ("acceleration", "momentum")
 LEAST_VARIANCE = 1e-12
-"""Variance that is added to that of the friction of a contact, which exceeds rounding errors [N²]."""
+"""Least variance of the friction of a contact, which exceeds rounding errors [N²]."""
 LEAST_NOISE = 1e-9
 """Minimum velocity noise, which exceeds rounding errors [rad/s, m/s]."""
 THRESHOLD = 5.0
@@ -281,7 +281,9 @@ class ContactUnknown:
         to_tangent = torch.linalg.pinv((t.mT @ point.jacobian).mT)
         mean, covariance = friction
         C = to_tangent @ covariance @ to_tangent.mT + torch.diag_embed(variance[:, None].expand(-1, 2))
-        R = torch.linalg.cholesky(C + LEAST_VARIANCE * torch.eye(2).to(C))
+        # The covariance of F_z is a difference, which rounding may make indefinite.
+        sizes, axes = torch.linalg.eigh(0.5 * (C + C.mT))
+        R = axes * sizes.clamp(min=LEAST_VARIANCE).sqrt()[..., None, :]
         # n − μ s(v)
         direction = n
         for law in fit.posterior.process.coulomb:
