@@ -20,11 +20,12 @@ import forcegp
 from forcegp import kinematics
 from forcegp.cli import app
 from forcegp.models.structured_fit import StructuredFit
-from forcegp.report.animation import animation_source
+from forcegp.report.animation import animation_source, arm_points
 from forcegp.robot.shapes import shapes_of
 from forcegp.view.motion import Motion, at_rest, of_log, pictures, with_rollout
 from forcegp.view.page import ARROW, content_of, force_text, serve, write_view
 from forces.cases import logged, two_contacts
+from robots import example_data
 
 ROUNDED = 2e-5
 """Coordinates in a page are rounded to 10 µm."""
@@ -158,3 +159,12 @@ def test_one_motion_at_a_time(tmp_path: Path) -> None:
     done = CliRunner().invoke(app, ["view", "kuka_plane", *both])
     assert done.exit_code != 0
     assert "cannot be combined" in str(done.exception)
+
+
+def test_a_free_base_is_drawn_where_it_is() -> None:
+    robot = forcegp.load_robot(example_data() / "solo_description/robots/solo12.urdf", base="free")
+    q = torch.zeros(1, robot.nq, dtype=torch.float64)
+    q[0, :3] = torch.tensor([1.0, 2.0, 3.0])
+    points = arm_points(robot, q, "FL_FOOT", (0.0, 0.0, 0.0))
+    assert points.shape[1] == 5, "the base, the three joints of a leg, and its foot"
+    torch.testing.assert_close(points[0, 0], q[0, :3])

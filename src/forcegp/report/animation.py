@@ -53,15 +53,20 @@ def _script() -> str:
 
 
 def arm_points(robot: RobotModel, q: Tensor, frame: str, point: Sequence[float]) -> Tensor:
-    """Return the base, the link origins along the chain, and the tip, `(frames, points, 3)` [m]."""
+    """Return the base, the link origins along the chain, and the tip, `(frames, points, 3)` [m].
+
+    A free base is where its last joint is.
+    """
     poses = kinematics.link_poses(robot, q)
     joint = robot.frame_parents[robot.frame_index(frame)]
     chain: list[int] = []
     while joint != BASE:
         chain.insert(0, joint)
         joint = robot.parents[joint]
-    origins = poses.position[:, chain] + robot.base_position
-    base = robot.base_position.expand(len(q), 1, 3)
+    moved = [joint for joint in chain if robot.driven[joint]]
+    first = chain[: len(chain) - len(moved)][-1:]
+    origins = poses.position[:, first + moved] + robot.base_position
+    base = robot.base_position.expand(len(q), 0 if first else 1, 3)
     tip = kinematics.point_position(robot, q, frame, tuple(point))[:, None]
     return torch.cat([base, origins, tip], dim=1)
 
