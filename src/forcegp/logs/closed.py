@@ -25,11 +25,11 @@ SEPARATION, SHARP, RELEASE_STD, RELEASE = 6.0, 16.0, 4.0, 0.01
 """Minimum difference between the force levels of open and closed contact, in standard deviations of the open
 level: for a result, and for a result from λ without the motion. Minimum margin above the open level in closed
 intervals, in the same unit and as a fraction of it."""
-MOVES, LEAVING, LEFT, PULL = 3.0, 0.04, 5e-3, 0.1
-"""Minimum ratio of the normal speed where λ is low to that where it is high, if the motion is to decide.
-Smallest speed of a point that leaves its surface [m/s], which moves it by `TOUCHING` in 25 ms, and smallest
-distance at which it has left, while the base of an estimator drifts by millimetres [m]. Largest pull on a
-closed contact as a fraction of its usual λ, since λ has errors."""
+USUAL, MOVES, LEAVING, LEFT, PULL = 0.95, 3.0, 0.04, 3e-3, 0.1
+"""Quantile that limits λ, beyond which it may be an impact. Minimum ratio of the normal speed where λ is low
+to that where it is high, if the motion is to decide. Smallest speed of a point that leaves its surface [m/s],
+at which it moves by `TOUCHING` in 25 ms, and smallest distance at which it has left [m], while the base of an
+estimator drifts. Largest pull on a closed contact as a fraction of its usual λ, since λ has errors."""
 TOUCHING, DISTANCE_STD, SMALLEST_DISTANCE = 1e-3, 6.0, 1e-6
 """Largest distance in contact [m]; margin above the median distance in contact, in standard deviations;
 smallest margin, to allow for rounding [m]. A mapping may override the result."""
@@ -108,11 +108,13 @@ def closed_by_force(
     If the levels of λ are not sharp, the motion also decides: `moves` `(n, 2)` holds c [m] and ċ [m/s]. Raise
     `DataError` if neither is distinct.
     """
-    if moves is not None and section.threshold is None and not (levels := Levels.of(values)).differ(SHARP):
-        low = -PULL * levels.closed
-        closed = resting(signals, values, moves, levels.high, low, section.shortest)
+    stated = section.threshold is not None or section.release is not None
+    if moves is not None and not stated and not (levels := Levels.of(values)).differ(SHARP):
+        # Impacts of several times the weight would raise the threshold.
+        high, low = Levels.of(np.minimum(values, np.quantile(values, USUAL))).high, -PULL * levels.closed
+        closed = resting(signals, values, moves, high, low, section.shortest)
         if closed is not None:
-            return closed, levels.high, low, f"{section.source} and motion"
+            return closed, high, low, f"{section.source} and motion"
     high, low = force_levels(values, name, section)
     return hysteresis(values, high, low, signals.segment), high, low, section.source
 
@@ -128,6 +130,8 @@ def resting(
     where λ is high is not much smaller than elsewhere.
     """
     (c, speed), pressed = moves.T, multiplier > high
+    if pressed.all() or not pressed.any():
+        return None
     apart, usual = int(shortest / np.median(np.diff(signals.t))), spread_about_zero(speed[pressed])
     place = np.full_like(c, np.nan)
     for rows in signals.runs():
