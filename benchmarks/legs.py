@@ -2,6 +2,7 @@
 
     python benchmarks/legs.py --json legs.json            # two robots, three frictions, two seeds
     python benchmarks/legs.py --robot solo12 --friction coulomb --seeds 0
+    python benchmarks/legs.py --case touchdown         # labels of closed feet from an imported log
 
 The true robot has joint friction, a payload of a tenth of its mass on the trunk, and links that differ from
 the file by 5 %. Torques, encoders and the IMU are noisy. Training logs hold standing, swaying and a trot;
@@ -12,6 +13,11 @@ trunk while swaying.
 - `equations of motion`: M q̈ − Q_K − τ = Σ JᵀF with the file, by generalized least squares.
 - `identified`: the same with friction, trunk and links by least squares from the training log.
 - `forcegp`: `contact_force` of a default fit.
+
+`--case touchdown` imports a trot and a walk of 30 s each with `source = "multiplier"` for all feet, and
+compares touch-down and lift-off with the engine's. A flight is an interval of 50 ms or more without force.
+The first second, in which steps grow from zero, counts separately. Encoders are noisy, and the base is either
+exact or that of an estimator, which is off by 5 mm.
 """
 
 from __future__ import annotations
@@ -20,6 +26,7 @@ import argparse
 import itertools
 import json
 import re
+import tempfile
 import time
 import warnings
 from collections.abc import Callable
@@ -33,11 +40,14 @@ import torch
 from numpy.typing import NDArray
 from real_cases import example_file
 from results_page import table
+from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 import forcegp
 from forcegp.errors import optional_module
 from forcegp.kinematics import frame_jacobian
+from forcegp.logs import import_log, parse_mapping
+from forcegp.rows import intervals
 
 mujoco = optional_module("mujoco", "This benchmark")
 Array = NDArray[np.float64]
@@ -49,7 +59,7 @@ HARD = 0.002
 friction depends on their acceleration."""
 STEP, RATE = 0.0005, 500
 """Time step of the engine [s] and rate of the log [Hz]."""
-SECONDS = {"train": 20.0, "test": 10.0}
+SECONDS = {"train": 20.0, "test": 10.0, "labels": 30.0}
 EVERY, TESTED = 5, 5
 """Every so many rows are learned from, and tested."""
 LINKS, PAYLOAD = 0.05, 0.1
@@ -60,6 +70,13 @@ sheet of the Bosch BMI088."""
 TURNING, TORQUE = 2.0, 0.005
 """White noise of accelerations from differences of encoders and of the gyro [rad/s²], and of torques over the
 largest torque."""
+ENCODER = 1.2e-4
+"""White noise of encoders [rad], which the default filter turns into `TURNING`."""
+DRIFT = {"position": 3e-3, "velocity": 0.01, "correlation": 0.1, "leak": 2.0, "turn": 2e-3}
+"""Errors of an estimator of the base: constant [m], of the velocity with its correlation time [m/s, s], which
+the position forgets after some seconds, and of the orientation [rad]. The position is off by 5 mm RMS."""
+FLIGHT, TOLERANCE, STARTED = 0.05, 0.01 + 1e-9, 1.0
+"""Least duration of a flight, tolerance of a found touch-down or lift-off, and duration of the start [s]."""
 METHODS = ("legs", "equations of motion", "identified", "forcegp")
 
 
@@ -447,8 +464,7 @@ def case(name: str, friction: str, seed: int) -> dict[str, Any]:
     """Scores of all methods on one robot."""
     legged = Legged(name, friction, seed)
     system = system_of(legged)
-    trot = legged.steps(np.array([0.0, 0.5, 0.5, 0.0]), 0.55, 1.8, np.array([0.04, 0.0, 0.0]))
-    walk = legged.steps(np.array([0.0, 0.5, 0.75, 0.25]), 0.78, 1.0, np.array([0.05, 0.0, 0.0]))
+    trot, walk = gaits(legged).values()
     parts = [(legged.sway(), 0.4 * SECONDS["train"]), (trot, 0.6 * SECONDS["train"])]
     train = forcegp.Dataset.concatenate([dataset(legged, legged.record(*part)) for part in parts])
     test = dataset(legged, legged.record(walk, SECONDS["test"]))[::TESTED]
@@ -480,10 +496,133 @@ def case(name: str, friction: str, seed: int) -> dict[str, Any]:
     return result
 
 
+def wander(random: np.random.Generator, rows: int, std: float, seconds: float) -> Array:
+    """Three Ornstein-Uhlenbeck processes `(rows, 3)` with a correlation time."""
+    keep = np.exp(-1.0 / (RATE * seconds))
+    steps = std * random.standard_normal((rows, 3))
+    steps[1:] *= np.sqrt(1.0 - keep**2)
+    return lfilter([1.0], [1.0, -keep], steps, axis=0)
+
+
+def columns(legged: Legged, rows: dict[str, Array], estimated: bool) -> dict[str, Array]:
+    """Columns of a logger, `name.part`, with a base that is exact or estimated."""
+    random, n, base = legged.random, len(rows["t"]), float(estimated)
+    R = Rotation.from_quat(np.roll(rows["q"][:, 3:7], -1, axis=1))
+    error = base * wander(random, n, DRIFT["velocity"], DRIFT["correlation"])
+    moved = lfilter([1.0 / RATE], [1.0, -np.exp(-1.0 / (RATE * DRIFT["leak"]))], error, axis=0)
+    p = rows["q"][:, :3] + moved + base * DRIFT["position"] * random.standard_normal(3)
+    turn = Rotation.from_rotvec(base * wander(random, n, DRIFT["turn"], DRIFT["leak"]))
+
+    def noisy(x: Array, std: float) -> Array:
+        return x + std * random.standard_normal(x.shape)
+
+    vectors = {
+        "p": (p, "xyz"),
+        "r": (np.roll((turn * R).as_quat(), 1, axis=1), "wxyz"),
+        "v": (rows["qd"][:, :3] + error, "xyz"),
+        "w": (noisy(rows["qd"][:, 3:6], GYRO), "xyz"),
+        "f": (noisy(R.inv().apply(rows["qdd"][:, :3] + [0.0, 0.0, 9.81]), ACCELEROMETER), "xyz"),
+        "q": (noisy(rows["q"][:, legged.at], ENCODER), legged.names),
+        "tau": (noisy(rows["tau"], TORQUE * np.abs(rows["tau"]).max()), legged.names),
+    }
+    parts = {f"{name}.{part}": x[:, k] for name, (x, of) in vectors.items() for k, part in enumerate(of)}
+    return {"t": rows["t"], **parts}
+
+
+def mapping(legged: Legged) -> str:
+    """Mapping of such a log."""
+    robot = legged.robot
+    frame = next(x for k, x in enumerate(robot.frame_names) if robot.frame_parents[k] == 5)
+    three = {name: [f"{name}.{axis}" for axis in "xyz"] for name in "pvwf"}
+    feet = "".join(f'[contact.{foot}]\nsource = "multiplier"\n' for foot in legged.kind.feet)
+    return f"""
+        time = {{ column = "t" }}
+        position = {{ column = "q.{{joint}}", unit = "rad" }}
+        torque = {{ column = "tau.{{joint}}", unit = "Nm" }}
+        [base]
+        position = {three["p"]}
+        quaternion = ["r.w", "r.x", "r.y", "r.z"]
+        quaternion_order = "wxyz"
+        linear_velocity = {three["v"]}
+        linear_axes = "world"
+        imu_frame = "{frame}"
+        gyro = {three["w"]}
+        accelerometer = {three["f"]}
+        gravity = true
+        {feet}"""
+
+
+def gaits(legged: Legged) -> dict[str, Callable[[float], Array]]:
+    """A trot and a walk."""
+    return {
+        "trot": legged.steps(np.array([0.0, 0.5, 0.5, 0.0]), 0.55, 1.8, np.array([0.04, 0.0, 0.0])),
+        "walk": legged.steps(np.array([0.0, 0.5, 0.75, 0.25]), 0.78, 1.0, np.array([0.05, 0.0, 0.0])),
+    }
+
+
+def switches(closed: Array, t: Array) -> tuple[Array, Array]:
+    """Times of touch-down and of lift-off, apart from contacts and flights that are too short."""
+    least = round(FLIGHT * RATE)
+    spans = [s for s in intervals(closed, join=least - 1) if s[1] - s[0] >= least]
+    return t[[a for a, _ in spans if a > 0]], t[[b for _, b in spans if b < len(t)]]
+
+
+def apart(times: Array, others: Array) -> Array:
+    """Time from the nearest of some times to each of the others [s], infinite if there is none."""
+    if not len(times):
+        return np.full(len(others), np.inf)
+    return others - times[np.abs(others[:, None] - times).argmin(axis=1)]
+
+
+def labels(spans: list[Any], acts: Array, t: Array) -> dict[str, Any]:
+    """Scores of the closed intervals of each foot, against rows with a force `(feet, n)`."""
+    errors: dict[str, list[Array]] = {"touch_down": [], "lift_off": []}
+    began, false, same = [], 0, []
+    for own, truth in zip(spans, acts, strict=True):
+        closed = np.any([(t >= a - 1e-6) & (t <= b + 1e-6) for a, b in own], axis=0)
+        same.append(float((closed == truth).mean()))
+        for key, true, found in zip(errors, switches(truth, t), switches(closed, t), strict=True):
+            off, early = -apart(found, true), true < STARTED
+            errors[key].append(off[~early])
+            began.append(off[early])
+            false += int((np.abs(apart(true, found[found >= STARTED])) > TOLERANCE).sum())
+    joined = {key: np.concatenate(x) for key, x in errors.items()}
+    hit = np.abs(np.concatenate(list(joined.values()))) <= TOLERANCE
+    return {
+        "switches": len(hit),
+        "found": float(hit.mean()),
+        "found_in_first_second": float((np.abs(np.concatenate(began)) <= TOLERANCE).mean()),
+        "false_per_minute": 60.0 * false / float(t[-1] - STARTED),
+        **{f"{key}_ms": (1e3 * np.quantile(x, [0.05, 0.5, 0.95])).tolist() for key, x in joined.items()},
+        "rows_agree": float(np.mean(same)),
+    }
+
+
+def touchdown(name: str, friction: str, seed: int) -> list[dict[str, Any]]:
+    """Touch-down and lift-off of all feet in imported logs, by gait and base."""
+    legged, results = Legged(name, friction, seed), []
+    system = system_of(legged)
+    for gait, wanted in gaits(legged).items():
+        rows = legged.record(wanted, SECONDS["labels"])
+        t, acts = rows["t"], np.linalg.norm(rows["force"], axis=-1) > 0.0
+        for base in ("exact", "estimated"):
+            log = columns(legged, rows, base == "estimated")
+            with tempfile.TemporaryDirectory() as folder:
+                path = Path(folder) / "log.csv"
+                np.savetxt(
+                    path, np.column_stack(list(log.values())), "%.9g", ",", header=",".join(log), comments=""
+                )
+                read = import_log(path, system, parse_mapping(mapping(legged).encode(), "mapping"))
+            results.append({"gait": gait, "base": base, "rows_kept": len(read.data) / len(t)})
+            results[-1] |= labels([each.intervals for each in read.contacts], acts.T, t)
+    return results
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
+    parser.add_argument("--case", choices=("forces", "touchdown"), default="forces")
     parser.add_argument("--robot", choices=tuple(ROBOTS), action="append")
     parser.add_argument("--friction", choices=FRICTIONS, action="append")
     parser.add_argument("--seeds", type=int, nargs="*", default=[0, 1])
@@ -492,17 +631,31 @@ def main() -> None:
     torch.set_num_threads(1)
     warnings.simplefilter("ignore")
     robots, frictions = options.robot or tuple(ROBOTS), options.friction or FRICTIONS
+    head = ["case", "RMSE [N]", "÷ legs", "÷ equations", "÷ identified", "coverage of ±2σ"]
+    if options.case == "touchdown":
+        head = ["case", "within 10 ms", "false per minute", "touch-down [ms]", "lift-off [ms]", "rows"]
     results, lines = [], []
     for seed, name, friction in itertools.product(options.seeds, robots, frictions):
-        found = case(name, friction, seed)
-        results.append({"robot": name, "friction": friction, "seed": seed, **found})
+        label, of = f"{name}, {friction}, {seed}", {"robot": name, "friction": friction, "seed": seed}
+        if options.case == "touchdown":
+            for each in touchdown(name, friction, seed):
+                results.append(of | each)
+                down, up = (
+                    " ".join(f"{x:.0f}" for x in each[key]) for key in ("touch_down_ms", "lift_off_ms")
+                )
+                shares = f"{each['found']:.3f} of {each['switches']}", f"{each['false_per_minute']:.0f}"
+                more = f"{each['rows_agree']:.3f}"
+                lines.append([f"{label}, {each['gait']}, {each['base']}", *shares, down, up, more])
+                print(lines[-1], flush=True)
+            continue
+        scores = case(name, friction, seed)
+        results.append(of | scores)
         print(json.dumps(results[-1]), flush=True)
-        own = found["forcegp"]
-        size = {key: float(np.linalg.norm(found[key]["rmse_N"])) for key in METHODS}
+        size = {key: float(np.linalg.norm(scores[key]["rmse_N"])) for key in METHODS}
         ratios = [f"{size['forcegp'] / size[key]:.2f}" for key in METHODS[:3]]
-        covered = " ".join(f"{x:.2f}" for x in own["coverage"])
-        lines.append([f"{name}, {friction}, {seed}", f"{size['forcegp']:.2f}", *ratios, covered])
-    print(table(["case", "RMSE [N]", "÷ legs", "÷ equations", "÷ identified", "coverage of ±2σ"], lines))
+        covered = " ".join(f"{x:.2f}" for x in scores["forcegp"]["coverage"])
+        lines.append([label, f"{size['forcegp']:.2f}", *ratios, covered])
+    print(table(head, lines))
     if options.json:
         options.json.write_text(json.dumps(results, indent=2) + "\n", encoding="utf-8")
 

@@ -82,6 +82,14 @@ def test_feet_of_a_walking_robot() -> None:
 
 
 @pytest.mark.slow
+def test_touch_down_and_lift_off_are_found_in_an_imported_log(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(legs.SECONDS, "labels", 10.0)
+    for each in legs.touchdown("solo12", "dahl", 3):
+        assert each["switches"] > 60 and each["found"] > 0.95, "98 % of long logs; the first steps are tiny"
+        assert max(np.abs([*each["touch_down_ms"], *each["lift_off_ms"]])) <= 10.0
+
+
+@pytest.mark.slow
 def test_the_base_has_exact_torques_and_the_trunk_is_weighed() -> None:
     *_, added = walking()
     fit = fitted()
