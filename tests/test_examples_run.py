@@ -93,6 +93,19 @@ def test_ur5_wiping(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+def test_quadruped_feet(tmp_path: Path) -> None:
+    for package in ("mujoco", "cmeel"):
+        pytest.importorskip(package)
+    text = example("quadruped_feet", tmp_path)
+    (agree,) = numbers(r"labels agree with MuJoCo in ([\d.]+)%", text)
+    assert agree > 93.0, "a foot that chatters counts as closed"
+    mean, error, inside = numbers(
+        r"feet: ([\d.]+) N on average, error ([\d.]+) N, within 2 sigma (\d+)%", text
+    )
+    assert error < 0.15 * mean and inside > 50, "bars are too narrow while friction changes its direction"
+
+
+@pytest.mark.slow
 def test_payload_followed_online(tmp_path: Path) -> None:
     rows = re.findall(
         r"([\d.]+) \+- ([\d.]+) kg, true ([\d.]+)", example("payload_followed_online", tmp_path)
