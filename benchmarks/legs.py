@@ -501,7 +501,7 @@ def wander(random: np.random.Generator, rows: int, std: float, seconds: float) -
     keep = np.exp(-1.0 / (RATE * seconds))
     steps = std * random.standard_normal((rows, 3))
     steps[1:] *= np.sqrt(1.0 - keep**2)
-    return lfilter([1.0], [1.0, -keep], steps, axis=0)
+    return np.asarray(lfilter([1.0], [1.0, -keep], steps, axis=0))
 
 
 def columns(legged: Legged, rows: dict[str, Array], estimated: bool) -> dict[str, Array]:
