@@ -144,7 +144,7 @@ def resting(
     if not held.any() or not np.sqrt(np.mean(speed[~pressed] ** 2)) > MOVES * usual:
         return None
     near = away <= max(LEFT, DISTANCE_STD * spread_about_zero(away[held]))
-    slow = np.abs(speed) <= max(LEAVING, DISTANCE_STD * usual)
+    slow = np.abs(speed) <= max(LEAVING, RELEASE_STD * usual)
     stays, closed = pressed | (near & slow & (multiplier > low)), np.zeros_like(pressed)
     for rows in signals.runs():
         for a, b in intervals(stays[rows], join=apart):
