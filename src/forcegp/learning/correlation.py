@@ -108,8 +108,8 @@ def residual_times(
             continue
         std = dataclasses.replace(problem, training=training).noise_at(hyperparameters, i)
         parts = [
-            _torque_noise(posterior, problem, hyperparameters, m[own], std if std.ndim == 1 else std[own])
-            for own in rows.split(CHUNK_STATES)
+            _torque_noise(posterior, problem, hyperparameters, m[piece], std if std.ndim == 1 else std[piece])
+            for piece in rows.split(CHUNK_STATES)
         ]
         noise, white = (torch.cat(part) for part in zip(*parts, strict=True))
         segment, white = m.segment[rows], white.mean(0)

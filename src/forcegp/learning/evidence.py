@@ -164,9 +164,9 @@ def fixed_point(
     return Evidence(log_s, w, V, add(1.0 - V.diagonal()), log_evidence)
 
 
-def worth(found: Evidence, columns: Tensor) -> float:
+def worth(evidence: Evidence, columns: Tensor) -> float:
     """Return ½ ŵᵀV⁻¹ŵ + ½ log |V| for the given columns, their log evidence over their absence [nats]."""
-    w, L = found.weights[columns], torch.linalg.cholesky(found.variance[columns][:, columns])
+    w, L = evidence.weights[columns], torch.linalg.cholesky(evidence.variance[columns][:, columns])
     return 0.5 * float(torch.cholesky_solve(w[:, None], L)[:, 0] @ w) + float(L.diagonal().log().sum())
 
 
@@ -191,18 +191,18 @@ def without_idle(
     Returns:
         The evidence, and the mask `(g,)` of the groups that remain.
     """
-    kept, found, left = free.clone(), fixed_point(sums, groups, stated, free), list(families)
+    kept, evidence, remaining = free.clone(), fixed_point(sums, groups, stated, free), list(families)
     while True:
         costs = []
-        for family in left:
+        for family in remaining:
             columns = torch.cat([groups[g].columns for g in family])
             # A column that is zero in the log, such as that of an unknown recording, has no evidence.
             acts = int((sums.G.diagonal()[columns] > 0.0).sum())
-            seen = float(found.determined[torch.tensor(family)].sum()) > DETERMINED * acts
-            costs.append(worth(found, columns) if seen else 0.0)
+            seen = float(evidence.determined[torch.tensor(family)].sum()) > DETERMINED * acts
+            costs.append(worth(evidence, columns) if seen else 0.0)
         if not costs or min(costs) >= -DECISIVE:
-            return found, kept
-        idle = left.pop(costs.index(min(costs)))
-        start = found.log_scales.clone()
+            return evidence, kept
+        idle = remaining.pop(costs.index(min(costs)))
+        start = evidence.log_scales.clone()
         kept[idle], start[idle] = False, math.log(SMALLEST)
-        found = fixed_point(sums, groups, stated, kept, start)
+        evidence = fixed_point(sums, groups, stated, kept, start)

@@ -84,8 +84,8 @@ def learned(
         return Lesson(prepared(spec, problem, search.held), search.held)
     # 3. Scales of columns and variances of rows, or hyperparameters of kernels
     columns = is_regression(spec, problem)
-    found = (_of_columns if columns else _of_kernels)(spec, problem, search, progress, begin)
-    part, values = found.problem, dict(found.hyperparameters)
+    lesson = (_of_columns if columns else _of_kernels)(spec, problem, search, progress, begin)
+    part, values = lesson.problem, dict(lesson.hyperparameters)
     if spec.noise.learns_torque:
         # Given priors on links move the robot.
         part = with_updated_robot(part, values)
@@ -98,8 +98,8 @@ def learned(
     keeps = columns and spec.options.inference != "exact"
     whole = dataclasses.replace(part, training=training, inducing=part.inducing if keeps else None)
     whole = prepared(spec, whole, values)
-    warnings = (*found.warnings, *_little_weight(spec, whole))
-    return dataclasses.replace(found, problem=whole, hyperparameters=values, warnings=warnings)
+    warnings = (*lesson.warnings, *_little_weight(spec, whole))
+    return dataclasses.replace(lesson, problem=whole, hyperparameters=values, warnings=warnings)
 
 
 def is_regression(spec: Specification, problem: Problem) -> bool:
@@ -123,11 +123,11 @@ def _of_columns(
         start |= noise
     problem = with_expectations(problem, spec.options.standardize)
     degrees = spec.noise.degrees_of_freedom
-    found = regression(problem, start, free.__contains__, spec.automatic, degrees, progress)
-    values, seconds = dict(found.values), time.perf_counter() - began
-    message = "the evidence is stationary" if found.converged else "stopped at the limit of alternations"
-    outcome = Learned(values, found.objective, found.converged, found.rounds, seconds, message)
-    return Lesson(found.problem, values, outcome, found.samples, worth=found.worth)
+    result = regression(problem, start, free.__contains__, spec.automatic, degrees, progress)
+    values, seconds = dict(result.values), time.perf_counter() - began
+    message = "the evidence is stationary" if result.converged else "stopped at the limit of alternations"
+    outcome = Learned(values, result.objective, result.converged, result.rounds, seconds, message)
+    return Lesson(result.problem, values, outcome, result.samples, worth=result.worth)
 
 
 def _of_kernels(
@@ -148,25 +148,25 @@ def _of_kernels(
     correlated = spec.noise.learns_torque and TORQUE_NOISE in search.start
     if correlated:
         part = dataclasses.replace(part, power=FIRST_POWER)
-    found, learned_on = search.solve(part, report, begin), part.training.samples
+    outcome, learned_on = search.solve(part, report, begin), part.training.samples
     sloped = part.state_std is not None
     sloped &= not is_sparse(spec.options.inference, part.priors, problem.training.all_samples)
     warnings: list[str] = []
     for number in range(ROUNDS):
         before = part
         if sloped:
-            part, found, doubts = with_learned_slopes(part, search, found, report)
+            part, outcome, doubts = with_learned_slopes(part, search, outcome, report)
             warnings += doubts
-        rest, values = part, search.values(found)
+        rest, values = part, search.values(outcome)
         if correlated and number == 0:
             part = dataclasses.replace(part, power=residual_times(part, values, part.training)[0])
         if spec.noise.degrees_of_freedom is not None:
             part = weighted(part, values, spec.noise.degrees_of_freedom)
         if part is not rest:
-            found = search.solve(part, report, found.tensors)
+            outcome = search.solve(part, report, outcome.tensors)
         if part is before:
             break
-    return Lesson(part, search.values(found), found, learned_on, tuple(dict.fromkeys(warnings)))
+    return Lesson(part, search.values(outcome), outcome, learned_on, tuple(dict.fromkeys(warnings)))
 
 
 def _little_weight(spec: Specification, whole: Problem) -> tuple[str, ...]:

@@ -91,9 +91,9 @@ def held_out_blocks(
 ) -> list[tuple[Tensor, Tensor, Tensor]]:
     """Return the residuals, variances and P of each block of the log (see `_held_out`)."""
     return [
-        _held_out(problem, hyperparameters, posterior, i, own)
+        _held_out(problem, hyperparameters, posterior, i, rows)
         for i in problem.training.motions
-        for own, posterior in posteriors_of_others(problem, hyperparameters, i)
+        for rows, posterior in posteriors_of_others(problem, hyperparameters, i)
     ]
 
 
@@ -101,21 +101,21 @@ def held_out_squares(problem: Problem, hyperparameters: Mapping[str, Tensor]) ->
     """Return the mean squared torque error of each joint on each block of the log `(blocks, nq)`."""
     squares = []
     for i in problem.training.motions:
-        for own, posterior in posteriors_of_others(problem, hyperparameters, i):
-            m = problem.training.measurements[i][own]
+        for rows, posterior in posteriors_of_others(problem, hyperparameters, i):
+            m = problem.training.measurements[i][rows]
             at = m.at(problem.system)
             z = affine_map(problem.system, at, m.quantity)
-            residual = _torque_error(problem, i, own, at, posterior.read_mean(problem.system, at, z))
+            residual = _torque_error(problem, i, rows, at, posterior.read_mean(problem.system, at, z))
             squares.append(residual.square().mean(0))
     return torch.stack(squares)
 
 
-def _torque_error(problem: Problem, i: int, own: Tensor, at: States, mean: Tensor) -> Tensor:
+def _torque_error(problem: Problem, i: int, rows: Tensor, at: States, mean: Tensor) -> Tensor:
     """Return the torque errors `(n, nq)` of rows of measurement i, M times those of accelerations."""
     m, weights = problem.training.measurements[i], problem.training.weights
-    error = m.values[own] - mean
+    error = m.values[rows] - mean
     error = error if m.quantity == "joint_force" else (at.eom.M @ error[..., None])[..., 0]
-    return error if weights is None else weights[i][own].sqrt()[:, None] * error
+    return error if weights is None else weights[i][rows].sqrt()[:, None] * error
 
 
 def growth(problem: Problem, hyperparameters: Mapping[str, Tensor], load: Tensor) -> Tensor:
@@ -141,11 +141,11 @@ def growth(problem: Problem, hyperparameters: Mapping[str, Tensor], load: Tensor
             if min(int(top.sum()), int((~top).sum())) < FEWEST:
                 continue
             rest = trained_region(m.qd[~top], tau[~top], load)
-            own = top.nonzero()[:, 0]
-            others = dataclasses.replace(problem, training=problem.training.without(i, own))
+            rows = top.nonzero()[:, 0]
+            others = dataclasses.replace(problem, training=problem.training.without(i, rows))
             posterior = force_posterior(others, hyperparameters)
-            residual, V, P = _held_out(problem, hyperparameters, posterior, i, own)
-            D = distance_beyond(rest, m.qd[own], tau[own])
+            residual, V, P = _held_out(problem, hyperparameters, posterior, i, rows)
+            D = distance_beyond(rest, m.qd[rows], tau[rows])
             reached = (P.diagonal(dim1=-2, dim2=-1) > 0.5) & (D > 0.0)
             square.append(residual.square()[reached])
             known.append((V + P.square() @ s2)[reached])
@@ -159,15 +159,15 @@ def growth(problem: Problem, hyperparameters: Mapping[str, Tensor], load: Tensor
         return misfit + 0.5 * PRIOR_SAMPLES * (log_c2 + RELATIVE**2 / c2)
 
     bounds = (2.0 * math.log(1e-2 * RELATIVE), 2.0 * math.log(1e2 * RELATIVE))
-    found = scipy.optimize.minimize_scalar(objective, bounds=bounds, method="bounded")
-    return math.exp(0.5 * float(found.x)) * load
+    minimum = scipy.optimize.minimize_scalar(objective, bounds=bounds, method="bounded")
+    return math.exp(0.5 * float(minimum.x)) * load
 
 
 def stretches(segment: Tensor) -> Tensor:
     """Return the block index of each sample. Blocks are segments, or eighths of a log with fewer segments."""
-    _, own = segment.unique(return_inverse=True)
-    if int(own.max()) + 1 >= RECORDINGS:
-        return own % MOST_STRETCHES
+    _, block = segment.unique(return_inverse=True)
+    if int(block.max()) + 1 >= RECORDINGS:
+        return block % MOST_STRETCHES
     n = len(segment)
     return torch.arange(n, device=segment.device) * STRETCHES // max(n, 1)
 
@@ -210,23 +210,23 @@ def _held_out(
     hyperparameters: Mapping[str, Tensor],
     posterior: ForcePosterior,
     i: int,
-    own: Tensor,
+    rows: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return torque residuals `(n, nq)` of rows of measurement i, their variance without noise, and P.
 
     Args:
         posterior: forces conditioned on other samples.
-        own: the rows.
+        rows: rows of the measurement.
     """
     training, std = problem.training, problem.noise_at(hyperparameters, i)
-    m, system = training.measurements[i][own], problem.system
+    m, system = training.measurements[i][rows], problem.system
     at = m.at(system)
     z, M = affine_map(system, at, m.quantity), at.eom.M
     if m.quantity == "joint_force":
         M = torch.eye(M.shape[-1], dtype=M.dtype, device=M.device).expand_as(M)
     P = M @ z.B_Q
     mean, covariance = posterior.read(system, at, z)
-    residual = _torque_error(problem, i, own, at, mean)
+    residual = _torque_error(problem, i, rows, at, mean)
     spread = (M @ covariance @ M.mT).diagonal(dim1=-2, dim2=-1)
     stick = (P**2 @ hidden_variance(hyperparameters, at, problem.external_std)[..., None])[..., 0]
     tips = tip_factor(hyperparameters, system, at)
@@ -247,12 +247,12 @@ def unit_scales(r2: Tensor, V: Tensor, share: Tensor, least: Tensor) -> Tensor:
     for _ in range(SWEEPS):
         before = s.clone()
         for i in range(len(s)):
-            own = share[:, i, i]
-            shows = own > 0.25
+            share_ii = share[:, i, i]
+            shows = share_ii > 0.25
             if int(shows.sum()) < FEWEST:
                 continue
-            others = (share[:, i] @ s**2 - own * s[i] ** 2 + V[:, i])[shows]
-            s[i] = _unit_scale(r2[shows, i] / own[shows], others / own[shows], least[i])
+            others = (share[:, i] @ s**2 - share_ii * s[i] ** 2 + V[:, i])[shows]
+            s[i] = _unit_scale(r2[shows, i] / share_ii[shows], others / share_ii[shows], least[i])
         if torch.allclose(s, before, rtol=SETTLED, atol=0.0):
             break
     return s

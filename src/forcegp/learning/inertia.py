@@ -84,50 +84,50 @@ def rigid_robot(robot: RobotModel, rows: Rows) -> Inertia:
     links = links_at(robot, rows) * prior.scale(robot)
     inertial = torch.cat([size * torch.diag_embed(rows.qdd), links], dim=-1)
     C = with_delay(rows, inertial)
-    (single, *_), found = _regressions(rows, inertial, M)
+    (single, *_), regression = _regressions(rows, inertial, M)
     judged = products(rows, C)
-    delay = found.clear_delay()
+    delay = regression.clear_delay()
     everything = torch.cat([torch.arange(C.shape[-1] - 1), delay])
     gain = GAIN * M.diagonal(dim1=-2, dim2=-1).mean(0) / size
-    kept = found.carried_drives(gain, delay)
+    kept = regression.carried_drives(gain, delay)
 
     def errors(estimate: Estimate) -> Tensor:
         """Return held-out errors of single samples. Averages would hide sharp friction."""
-        return held_out(single.by_stretch, estimate, judged, found.by_stretch)
+        return held_out(single.by_stretch, estimate, judged, regression.by_stretch)
 
     # Units of noise would let the joint with the largest errors decide for all.
-    unit = errors(lambda rest: found.estimate(rest, delay, n)).mean(0).maximum(single.noise**2)
+    unit = errors(lambda rest: regression.estimate(rest, delay, n)).mean(0).maximum(single.noise**2)
 
     def compared(estimate: Estimate) -> Tensor:
         """Return held-out errors relative to those of the robot file."""
         return errors(estimate) / unit
 
     def estimated(kept: Tensor) -> Tensor:
-        return compared(lambda rest: found.estimate(rest, kept, n))
+        return compared(lambda rest: regression.estimate(rest, kept, n))
 
     def accelerations(other: RobotModel, delta: Tensor) -> Tensor:
         return acceleration_errors(rows, single.by_stretch, C, delta, inertia_at(other, rows.q))
 
-    every, file, left = found.by_stretch.total(), estimated(delay), _errors(robot, size)
+    every, file, remaining = regression.by_stretch.total(), estimated(delay), _errors(robot, size)
     driving = torch.cat([kept, delay])
-    nothing, drives, delta = (found.estimate(every, kept, n) for kept in (delay, driving, everything))
+    nothing, drives, delta = (regression.estimate(every, kept, n) for kept in (delay, driving, everything))
     driven = estimated(driving)
     before, known = accelerations(robot, nothing), min((file, driven), key=lambda error: float(error.mean()))
     if _is_better(estimated(everything), known):
-        consistent, delta, change = _consistent(robot, prior, found, size, delay)
+        consistent, delta, change = _consistent(robot, prior, regression, size, delay)
         better = _is_better(compared(lambda _: delta), known)
         if better and is_harmless(accelerations(consistent, delta), before):
             per_gain = tuple(map(tuple, change.tolist()))
-            left = dataclasses.replace(left, per_gain=per_gain, delay=LATE * float(delta[-1]))
-            return Inertia(consistent, left, (IDENTIFIED,))
+            remaining = dataclasses.replace(remaining, per_gain=per_gain, delay=LATE * float(delta[-1]))
+            return Inertia(consistent, remaining, (IDENTIFIED,))
     while len(kept):
         with_drives = robot.replace(armature=robot.armature + size * drives[:n])
         harm = log_ratio(accelerations(with_drives, drives), before).mean(0)
         if float(harm.max()) <= TOLERATED:
-            return Inertia(with_drives, left)
+            return Inertia(with_drives, remaining)
         kept = kept[kept != kept[harm[kept].argmax()]]
-        drives = found.estimate(every, torch.cat([kept, delay]), n)
-    return Inertia(robot, left)
+        drives = regression.estimate(every, torch.cat([kept, delay]), n)
+    return Inertia(robot, remaining)
 
 
 def rescaled_robot(robot: RobotModel, rows: Rows, std: float) -> Inertia:
@@ -142,22 +142,22 @@ def rescaled_robot(robot: RobotModel, rows: Rows, std: float) -> Inertia:
         std: stated standard deviation of s.
     """
     scale, spread, beyond = torque_scale(robot, rows, std)
-    found = rigid_robot(robot, rows.scaled(scale))
-    for _ in range(ROUNDS if IDENTIFIED in found.doubts else 0):
+    inertia = rigid_robot(robot, rows.scaled(scale))
+    for _ in range(ROUNDS if IDENTIFIED in inertia.doubts else 0):
         # Y π for the changed links
-        before, after = (inertial_parameters(x.mass, x.com, x.inertia) for x in (robot, found.robot))
+        before, after = (inertial_parameters(x.mass, x.com, x.inertia) for x in (robot, inertia.robot))
         change = (links_at(robot, rows) @ (after - before).flatten()[:, None])[..., 0]
         known = dataclasses.replace(rows, residual=rows.residual - change)
         scale, spread, later = torque_scale(robot, known, std)
         beyond = torch.where(beyond > 0.0, beyond, later)
-        found = rigid_robot(robot, rows.scaled(scale))
-    robot = found.robot.replace(torque_scale=scale)
+        inertia = rigid_robot(robot, rows.scaled(scale))
+    robot = inertia.robot.replace(torque_scale=scale)
     far = [(joint, x) for joint, x in zip(robot.joint_names, beyond.tolist(), strict=True) if x]
     listed = ", ".join(f"{joint} {x:.2g}" for joint, x in far)
     doubt = f"torques seem to be the nominal ones times {listed}, which is beyond what is stated of them"
     doubts = (f"{doubt}, so they stay nominal: correct the constants, or state larger errors",) if far else ()
-    doubts = (*found.doubts, *doubts)
-    return dataclasses.replace(found, robot=robot, spread=tuple(spread.tolist()), doubts=doubts)
+    doubts = (*inertia.doubts, *doubts)
+    return dataclasses.replace(inertia, robot=robot, spread=tuple(spread.tolist()), doubts=doubts)
 
 
 def torque_scale(robot: RobotModel, rows: Rows, std: float) -> tuple[Tensor, Tensor, Tensor]:
@@ -170,13 +170,13 @@ def torque_scale(robot: RobotModel, rows: Rows, std: float) -> tuple[Tensor, Ten
     """
     n = robot.nq
     M, size = inertia_at(robot, rows.q), drive_scale(robot, rows.q)
-    _, found = _regressions(rows, size * torch.diag_embed(rows.qdd), M, std)
+    _, regression = _regressions(rows, size * torch.diag_embed(rows.qdd), M, std)
     drives, gains = torch.arange(n), torch.arange(n, 2 * n)
-    spread = found.read(2 * n, torch.cat([drives, gains]))[1][n:].sqrt()
+    spread = regression.read(2 * n, torch.cat([drives, gains]))[1][n:].sqrt()
     known = (spread < UNDETERMINED) & robot.driven
-    every, rejected = found.by_stretch.total(), torch.zeros_like(spread)
+    every, rejected = regression.by_stretch.total(), torch.zeros_like(spread)
     while True:
-        u = found.estimate(every, torch.cat([drives, gains[known]]), n)[n : 2 * n]
+        u = regression.estimate(every, torch.cat([drives, gains[known]]), n)[n : 2 * n]
         g = 1.0 + std * u
         beyond = (u.abs() > FARTHEST) | (g < LEAST_GAIN)
         if not bool(beyond.any()):
@@ -195,7 +195,7 @@ def _regressions(
 
 
 def _consistent(
-    robot: RobotModel, prior: InertialPrior, found: _Regression, size: Tensor, delay: Tensor
+    robot: RobotModel, prior: InertialPrior, regression: _Regression, size: Tensor, delay: Tensor
 ) -> tuple[RobotModel, Tensor, Tensor]:
     """Return the robot with physically consistent links and nonnegative drive inertia, the unknowns, and
     the change of the links' parameters and drives per relative error of each torque sensor's gain.
@@ -204,17 +204,17 @@ def _consistent(
     Drives whose inertia would be negative are removed. To first order, these steps minimise
     ½ (u − û)ᵀ P (u − û) + V(u) with the divergence V of the links, so ∂u/∂g = (P + V″)⁻¹ P ∂û/∂g.
     """
-    every, n = found.by_stretch.total(), len(size)
-    _, precision, per_gain = found.normal()
+    every, n = regression.by_stretch.total(), len(size)
+    _, precision, per_gain = regression.normal()
     links = torch.arange(n, len(precision) - 1)
-    unknowns = found.estimate(every, torch.cat([torch.arange(n), links, delay]), n)
+    unknowns = regression.estimate(every, torch.cat([torch.arange(n), links, delay]), n)
     while True:
         drives = (unknowns[:n] > 0.0).nonzero()[:, 0]
         others = torch.cat([drives, delay])
-        best = found.estimate(every, torch.cat([others, links]), n)
+        best = regression.estimate(every, torch.cat([others, links]), n)
         moved, delta = prior.updated(robot, best[links], _marginal(precision, links, others), weight=STATED)
         known = torch.zeros_like(best).index_put((links,), delta)
-        unknowns = found.estimate(every, others, n, known)
+        unknowns = regression.estimate(every, others, n, known)
         if bool((unknowns[drives] > 0.0).all()):
             break
     curvature = prior.around(robot).curvature(moved, STATED)
@@ -246,11 +246,11 @@ class _Regression:
     noise: Tensor
     power: float
 
-    def normal(self, given: NormalEquations | None = None) -> tuple[Tensor, Tensor, Tensor]:
+    def normal(self, equations: NormalEquations | None = None) -> tuple[Tensor, Tensor, Tensor]:
         """Return the linear term κ h, the precision κ H + 1, and the change of κ h per relative error of each
         gain `(p, nq)`, ignoring directions of negative H.
         """
-        H, h, per_gain = (given or self.by_stretch.total()).quadratic(self.noise)
+        H, h, per_gain = (equations or self.by_stretch.total()).quadratic(self.noise)
         values, vectors = torch.linalg.eigh(0.5 * (H + H.mT))
         shown = vectors * (values > 0.0)
         precision = self.power * (vectors * values.clamp(min=0.0)) @ vectors.mT
@@ -302,8 +302,8 @@ class _Regression:
         that creeps, as with the soft friction of a simulator, resists acceleration like a drive.
         """
 
-        def at(given: NormalEquations) -> tuple[Tensor, Tensor]:
-            h, precision, _ = self.normal(given)
+        def at(equations: NormalEquations) -> tuple[Tensor, Tensor]:
+            h, precision, _ = self.normal(equations)
             V = torch.linalg.inv(precision[unknowns][:, unknowns])
             return (V @ h[unknowns])[:n], V.diagonal()[:n]
 
@@ -313,17 +313,19 @@ class _Regression:
         change = (at(self.faster.total())[0] - u).square()
         return u, V.maximum((len(blocks) - 1) * others.var(0, correction=0)).maximum(change)
 
-    def estimate(self, given: NormalEquations, kept: Tensor, n: int, known: Tensor | None = None) -> Tensor:
+    def estimate(
+        self, equations: NormalEquations, kept: Tensor, n: int, known: Tensor | None = None
+    ) -> Tensor:
         """Return the most probable values of the unknowns `kept`, with nonnegative drives (the first n)."""
-        h, precision, _ = self.normal(given)
+        h, precision, _ = self.normal(equations)
         known = torch.zeros_like(h) if known is None else known
         h = h - precision @ known
         L = torch.linalg.cholesky(precision[kept][:, kept])
         right = torch.linalg.solve_triangular(L, h[kept, None], upper=False)[:, 0]
         lower = torch.where(kept < n, 0.0, -math.inf)
         bounds = lower.numpy(), math.inf
-        found = scipy.optimize.lsq_linear(L.mT.cpu().numpy(), right.cpu().numpy(), bounds, method="bvls")
-        return known.index_put((kept,), torch.from_numpy(found.x).to(h))
+        solution = scipy.optimize.lsq_linear(L.mT.cpu().numpy(), right.cpu().numpy(), bounds, method="bvls")
+        return known.index_put((kept,), torch.from_numpy(solution.x).to(h))
 
 
 def _marginal(precision: Tensor, kept: Tensor, others: Tensor) -> Tensor:
@@ -356,19 +358,21 @@ def _over_widths(
         by_stretch, faster = instrumental(used, columns), instrumental(fast, columns)
         kept = torch.arange(columns.shape[-1])
         every, mean = by_stretch.total(), columns.new_zeros(len(kept))
-        found = _Regression(by_stretch, faster, M.new_ones(n), 1.0)
+        regression = _Regression(by_stretch, faster, M.new_ones(n), 1.0)
         for _ in range(PASSES):
-            left = used.residual - columns @ mean - (used.friction * every.friction(mean)).sum(-1)
-            left = used.weight * left
-            noise = (left.square().sum(0) / used.weight.square().sum(0).clamp(min=1)).sqrt().clamp(min=1e-300)
-            found = _Regression(by_stretch, faster, noise, _power(used, left / noise))
-            mean = found.estimate(every, kept, n)
-        yield found
+            residual = used.residual - columns @ mean - (used.friction * every.friction(mean)).sum(-1)
+            residual = used.weight * residual
+            noise = (
+                (residual.square().sum(0) / used.weight.square().sum(0).clamp(min=1)).sqrt().clamp(min=1e-300)
+            )
+            regression = _Regression(by_stretch, faster, noise, _power(used, residual / noise))
+            mean = regression.estimate(every, kept, n)
+        yield regression
 
 
-def _power(rows: Rows, left: Tensor) -> float:
+def _power(rows: Rows, residual: Tensor) -> float:
     """Return κ = 1/τ̄ for the unexplained residual, as in `residual_times`."""
-    times = autocorrelation_time(left[: rows.leading], rows.segment[: rows.leading])
+    times = autocorrelation_time(residual[: rows.leading], rows.segment[: rows.leading])
     return min(1.0, math.exp(-float(times.log().mean())))
 
 
@@ -468,10 +472,10 @@ def with_ripple(robot: RobotModel, rows: Rows) -> Rows:
     X = [links_at(robot, rows), rows.qdd[..., None] * eye, rows.friction]
     X = torch.cat(X, dim=-1).transpose(0, 1)
     X = X / X.square().mean(1, keepdim=True).sqrt().clamp(min=1e-300)
-    left = rows.residual - (X @ ridged(X, rows.residual.T)[..., None])[..., 0].T
+    residual = rows.residual - (X @ ridged(X, rows.residual.T)[..., None])[..., 0].T
     n = rows.leading
     turned = robot.drive_motion(rows.q)
-    ripple = ripple_of(turned[:n], left[:n])
+    ripple = ripple_of(turned[:n], residual[:n])
     if ripple is None:
         return rows
     waves = torch.stack([*ripple.columns(JointState(turned, rows.qd, rows.qd)).values()], dim=-1)
@@ -516,8 +520,8 @@ def with_updated_robot(problem: Problem, values: Mapping[str, Tensor]) -> Proble
             volume = _log_volume(problem, values)
             robot, _ = prior.updated(problem.system.robot, mean, precision, volume)
             # The prior keeps the scale of the parameters in the file, not of the updated ones.
-            left = dataclasses.replace(prior.around(problem.system.robot), is_error=True)
-            moved = problem.without_priors([prior.name]).with_priors([left], problem)
+            errors = dataclasses.replace(prior.around(problem.system.robot), is_error=True)
+            moved = problem.without_priors([prior.name]).with_priors([errors], problem)
             return dataclasses.replace(moved, system=problem.system.with_robot(robot))
     return problem
 

@@ -136,30 +136,30 @@ def regression(
     part = dataclasses.replace(problem, training=problem.training.evenly(SAMPLES), power=FIRST_POWER)
     noisy = learns(NOISE) and TORQUE_NOISE in start
     later = [prior.name for prior in part.priors if prior.remainder]
-    own = {key: value for key, value in start.items() if key.split(".")[0] in later}
-    rest = {key: value for key, value in start.items() if key not in own}
+    remainder = {key: value for key, value in start.items() if key.split(".")[0] in later}
+    rest = {key: value for key, value in start.items() if key not in remainder}
     named = without_inducing(part.without_priors(later))
 
     def of_laws(named: Problem, start: Tensors) -> Scales:
         return _alternating(named, start, learns, noisy, prunes, degrees_of_freedom, progress)
 
-    found = of_laws(named, rest)
-    if prunes and noisy and (ripple := ripple_in(found)) is not None:
+    scales = of_laws(named, rest)
+    if prunes and noisy and (ripple := ripple_in(scales)) is not None:
         others = [prior.name for prior in named.priors]
         named = named.with_priors([ripple])
-        found = of_laws(named, {**initial(named.without_priors(others), False), **rest})
+        scales = of_laws(named, {**initial(named.without_priors(others), False), **rest})
     if later:
-        found = with_remainder(part, found, own, learns, noisy, prunes)
-    values = {**found.values, **memory_noise(found)}
-    objective = -found.evidence.log_evidence
+        scales = with_remainder(part, scales, remainder, learns, noisy, prunes)
+    values = {**scales.values, **memory_noise(scales)}
+    objective = -scales.evidence.log_evidence
     return Regression(
-        found.problem.without_errors().with_priors(part.errors, part),
+        scales.problem.without_errors().with_priors(part.errors, part),
         values,
-        found.problem.training.samples,
-        found.rounds,
-        found.converged,
+        scales.problem.training.samples,
+        scales.rounds,
+        scales.converged,
         objective,
-        worth_of(found),
+        worth_of(scales),
     )
 
 
@@ -175,9 +175,9 @@ def _alternating(
     """Return scales and noise of laws, alternating with a search for Coulomb friction."""
     friction = [key for key in start if key.startswith(COULOMB + ".") and learns(COULOMB)]
     passes = PASSES if friction or degrees_of_freedom is not None else 1
-    found = learned_scales(part, dict(start), learns, noisy, prunes)
+    scales = learned_scales(part, dict(start), learns, noisy, prunes)
     for number in range(1, passes + 1):
-        part, values = found.problem, found.values
+        part, values = scales.problem, scales.values
         if progress is not None:
             progress(number, passes, math.nan)
         if number == passes:
@@ -189,19 +189,19 @@ def _alternating(
         if settled and degrees_of_freedom is None:
             break
         # The scales start from the stated ones again.
-        found = learned_scales(part, {**start, **searched}, learns, noisy, prunes, noise_of(values))
-    return found
+        scales = learned_scales(part, {**start, **searched}, learns, noisy, prunes, noise_of(values))
+    return scales
 
 
-def ripple_in(found: Scales) -> RipplePrior | None:
+def ripple_in(scales: Scales) -> RipplePrior | None:
     """Return the ripple in the residual torques, or `None` if there is none or it is known."""
-    problem, parts = found.problem, []
+    problem, parts = scales.problem, []
     if any(isinstance(prior, RipplePrior) for prior in problem.priors):
         return None
     for i, m in enumerate(problem.training.measurements):
         if m.quantity in MOTIONS:
-            rows = residuals(problem, found.values, found.evidence.weights, i)
-            torque, robot = rows.torque(*variances(problem, found.values)), problem.system.robot
+            rows = residuals(problem, scales.values, scales.evidence.weights, i)
+            torque, robot = rows.torque(*variances(problem, scales.values)), problem.system.robot
             parts.append((robot.drive_motion(m.q), robot.drive_torque(torque)))
     return ripple_of(*map(torch.cat, zip(*parts, strict=True))) if parts else None
 
@@ -226,21 +226,21 @@ def with_remainder(
     """
     later = [prior for prior in whole.priors if prior.remainder]
     names = {prior.name for prior in later}
-    given = laws.problem.without_errors()
-    problem = given.with_priors(later, whole)
+    base = laws.problem.without_errors()
+    problem = base.with_priors(later, whole)
     values = {**laws.values, **start}
     problem = with_inducing(problem, values, SUPPORT)
-    stated, own = {**values, **laws.stated_noise}, lambda name: name in names and learns(name)
-    found = learned_scales(problem, stated, own, noisy, False, noise_of(values))
-    found = dataclasses.replace(found, idle=laws.idle)
+    stated, learns_later = {**values, **laws.stated_noise}, lambda name: name in names and learns(name)
+    scales = learned_scales(problem, stated, learns_later, noisy, False, noise_of(values))
+    scales = dataclasses.replace(scales, idle=laws.idle)
     if not prunes or not all(map(learns, names)):
-        return found
-    changes = held_out_squares(found.problem, found.values) - held_out_squares(given, laws.values)
+        return scales
+    changes = held_out_squares(scales.problem, scales.values) - held_out_squares(base, laws.values)
     kept = _are_smaller(changes)
     if not any(kept):
         return laws
     return without_components(
-        found, [p for p, prior in enumerate(problem.priors) if prior.remainder], kept, noisy
+        scales, [p for p, prior in enumerate(problem.priors) if prior.remainder], kept, noisy
     )
 
 
@@ -265,42 +265,42 @@ def _coulomb(problem: Problem, values: Mapping[str, Tensor], keys: list[str]) ->
         return dict(Search(begin, held, QUICK).solve(few, begin=begin).tensors)
 
 
-def memory_noise(found: Scales) -> Tensors:
+def memory_noise(scales: Scales) -> Tensors:
     """Return the standard deviation `(nq,)` of the force of bristles at a state without past, if any.
 
     With columns φ of a joint and weights w ~ N(ŵ, V), the variance is Σ (ŵ ŵᵀ + V) E[φ φᵀ] over the log.
     """
-    problem, basis, variance = found.problem, basis_of(found.problem, found.values), {}
-    process = problem.process_at(found.values)
+    problem, basis, variance = scales.problem, basis_of(scales.problem, scales.values), {}
+    process = problem.process_at(scales.values)
     for p, prior in enumerate(problem.priors):
         past = [m for m in problem.training.measurements if m.history is not None]
         if prior.remembers and past:
             x = [process.features(p, problem.system, m.at(problem.system)) for m in past]
             phi = torch.cat([basis.parts[p].values(each)[0] for each in x], dim=1)
             square = phi.mT @ phi / phi.shape[1]
-            own = basis.of_process(p)
-            w = found.evidence.weights[own].view(len(phi), -1)
-            V = found.evidence.variance[own, own].view(*w.shape, *w.shape)
+            columns = basis.of_process(p)
+            w = scales.evidence.weights[columns].view(len(phi), -1)
+            V = scales.evidence.variance[columns, columns].view(*w.shape, *w.shape)
             V = torch.stack([V[j, :, j] for j in range(len(w))])
             each = ((w[:, :, None] * w[:, None] + V) * square).sum((1, 2))
             variance[MEMORY] = variance.get(MEMORY, 0.0) + each
     return {key: 0.5 * value.clamp(min=1e-24).log() for key, value in variance.items()}
 
 
-def worth_of(found: Scales) -> dict[str, float]:
+def worth_of(scales: Scales) -> dict[str, float]:
     """Return the log evidence of each prior and joint over its absence [nats]; 0 for those dropped.
 
     Errors of what the robot includes are not judged.
     """
-    result, joints, priors = {}, found.problem.system.robot.joint_names, found.problem.priors
-    for (p, k), family in families_of(found.groups).items():
+    result, joints, priors = {}, scales.problem.system.robot.joint_names, scales.problem.priors
+    for (p, k), family in families_of(scales.groups).items():
         if priors[p].is_error:
             continue
-        several = found.values[found.groups[family[0]].key].shape[0] > 1
+        several = scales.values[scales.groups[family[0]].key].shape[0] > 1
         part = f" of {joints[k]}" if priors[p].per_joint else f" {k + 1}" if several else ""
         name = f"{priors[p].name}{part}"
-        columns = torch.cat([found.groups[g].columns for g in family])
-        result[name] = 0.0 if (p, k) in found.idle else worth(found.evidence, columns)
+        columns = torch.cat([scales.groups[g].columns for g in family])
+        result[name] = 0.0 if (p, k) in scales.idle else worth(scales.evidence, columns)
     return result
 
 

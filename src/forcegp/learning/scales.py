@@ -123,14 +123,14 @@ def learned_scales(
     kept = torch.tensor([learns(group.key.split(".")[0]) for group in groups])
     none = fixed_point(sums, groups, sums.v.new_zeros(len(groups)), torch.zeros_like(kept))
     stated = torch.zeros_like(none.log_scales)
-    found = _alternated(Scales(problem, values, groups, none, stated, noise_of(start), kept), noisy)
+    scales = _alternated(Scales(problem, values, groups, none, stated, noise_of(start), kept), noisy)
     if not prunes:
-        return found
+        return scales
     families = {key: f for key, f in families_of(groups).items() if bool(kept[f].all())}
-    _, sums = _sums(found.problem, found.values)
-    evidence, left = without_idle(sums, groups, found.stated, kept, list(families.values()))
-    idle = tuple(key for key, family in families.items() if not bool(left[family].any()))
-    return _alternated(_moved(replace(found, kept=left, idle=idle), evidence), noisy)
+    _, sums = _sums(scales.problem, scales.values)
+    evidence, remaining = without_idle(sums, groups, scales.stated, kept, list(families.values()))
+    idle = tuple(key for key, family in families.items() if not bool(remaining[family].any()))
+    return _alternated(_moved(replace(scales, kept=remaining, idle=idle), evidence), noisy)
 
 
 def noise_of(values: Mapping[str, Tensor]) -> Tensors:
@@ -144,31 +144,33 @@ def _sums(problem: Problem, values: Tensors) -> tuple[list[Group], Sums]:
     return groups_of(problem.priors, basis), without_feedback(sums, remainder(problem.priors, basis))
 
 
-def _moved(found: Scales, evidence: Evidence) -> Scales:
+def _moved(scales: Scales, evidence: Evidence) -> Scales:
     """Return the columns with the scales of a new fixed point."""
-    values = with_scales(found.values, found.groups, evidence.log_scales)
-    return replace(found, values=values, evidence=evidence, stated=found.stated - evidence.log_scales)
+    values = with_scales(scales.values, scales.groups, evidence.log_scales)
+    return replace(scales, values=values, evidence=evidence, stated=scales.stated - evidence.log_scales)
 
 
-def _alternated(found: Scales, noisy: bool) -> Scales:
+def _alternated(scales: Scales, noisy: bool) -> Scales:
     """Alternate between scales and noise until neither changes."""
     for number in range(ROUNDS):
-        _, sums = _sums(found.problem, found.values)
-        found = _moved(found, fixed_point(sums, found.groups, found.stated, found.kept))
-        found = replace(found, rounds=found.rounds + 1, converged=not noisy)
+        _, sums = _sums(scales.problem, scales.values)
+        scales = _moved(scales, fixed_point(sums, scales.groups, scales.stated, scales.kept))
+        scales = replace(scales, rounds=scales.rounds + 1, converged=not noisy)
         if not noisy:
             break
-        before = _noise(found.values)
+        before = _noise(scales.values)
         speeds = AT_REST if number == 0 else ()
-        values, power = _with_noise(found, speeds)
+        values, power = _with_noise(scales, speeds)
         # The residuals of the first round still contain the forces to be learned.
-        least = min(power, found.least_power) if number else found.least_power
-        found = replace(found, problem=replace(found.problem, power=power), values=values, least_power=least)
+        least = min(power, scales.least_power) if number else scales.least_power
+        scales = replace(
+            scales, problem=replace(scales.problem, power=power), values=values, least_power=least
+        )
         size = before.maximum(_noise(values))
         change = (_noise(values) - before).abs()
         if bool((change <= SETTLED * size + NEGLIGIBLE * size.amax()).all()):
-            return replace(found, converged=True)
-    return found
+            return replace(scales, converged=True)
+    return scales
 
 
 def _noise(values: Mapping[str, Tensor]) -> Tensor:
@@ -236,20 +238,22 @@ class Residuals(NamedTuple):
         return both[..., -1], both[..., :-1]
 
 
-def without_components(found: Scales, priors: Sequence[int], kept: Sequence[bool], noisy: bool) -> Scales:
+def without_components(scales: Scales, priors: Sequence[int], kept: Sequence[bool], noisy: bool) -> Scales:
     """Drop components, such as joints, of some priors, and learn the noise again.
 
     Args:
         priors: indices of the priors.
         kept: whether to keep each component of these priors.
     """
-    gone = [g.prior in priors and not kept[g.index[0]] for g in found.groups]
+    gone = [g.prior in priors and not kept[g.index[0]] for g in scales.groups]
     dropped = torch.tensor(gone)
-    change = torch.where(dropped, math.log(SMALLEST) + found.stated, 0.0)
-    values = with_scales(found.values, found.groups, change)
-    idle = (*found.idle, *((p, k) for p in priors for k, keep in enumerate(kept) if not keep))
-    found = replace(found, values=values, stated=found.stated - change, kept=found.kept & ~dropped, idle=idle)
-    return _alternated(found, noisy)
+    change = torch.where(dropped, math.log(SMALLEST) + scales.stated, 0.0)
+    values = with_scales(scales.values, scales.groups, change)
+    idle = (*scales.idle, *((p, k) for p in priors for k, keep in enumerate(kept) if not keep))
+    scales = replace(
+        scales, values=values, stated=scales.stated - change, kept=scales.kept & ~dropped, idle=idle
+    )
+    return _alternated(scales, noisy)
 
 
 def residuals(problem: Problem, values: Mapping[str, Tensor], weights: Tensor, i: int) -> Residuals:
@@ -292,36 +296,36 @@ def variances(problem: Problem, values: Tensors) -> tuple[Tensor, Tensor]:
     return slides, rests
 
 
-def _with_noise(found: Scales, speeds: Sequence[float]) -> tuple[Tensors, float]:
+def _with_noise(scales: Scales, speeds: Sequence[float]) -> tuple[Tensors, float]:
     """Return the hyperparameters with updated torque noise and static friction, and the exponent κ.
 
     Args:
         speeds: speeds v_s to try, for contacts above the stated one; the present ones if there are none.
     """
-    problem, values = found.problem, found.values
+    problem, values = scales.problem, scales.values
     motions = [i for i, m in enumerate(problem.training.measurements) if m.quantity in MOTIONS]
-    each = [residuals(problem, values, found.evidence.weights, i) for i in motions]
+    each = [residuals(problem, values, scales.evidence.weights, i) for i in motions]
     power = exponent(problem, motions, each, *variances(problem, values))
     widest = max(rows.r.shape[-1] for rows in each)
     parts = zip(*(rows.padded(widest) for rows in each), strict=True)
     whole = Residuals(*map(torch.cat, parts))
     nq, tips = whole.external.shape[-1], [tip_keys(name) for name in learned_tips(problem.system, values)]
     keys, theta = variance_keys(problem, values), torch.cat(variances(problem, values))
-    gamma = determined_by_joint(problem, found.groups, found.evidence)
+    gamma = determined_by_joint(problem, scales.groups, scales.evidence)
     share = (1.0 - gamma / (power * len(whole.r))).clamp(min=LEAST_SHARE)
     share = torch.nn.functional.pad(share, (0, len(tips)), value=1.0).repeat(2)
     driven = problem.system.robot.driven
     # The load moves between the feet of a robot with a free base, and so does the size of these forces.
     known = torch.nn.functional.pad(~driven, (0, len(tips)), value=not bool(driven.all())).repeat(2)
-    variance = torch.cat(variances(problem, found.stated_noise))
-    stated = Stated(variance, min(power, found.least_power), share, known)
+    variance = torch.cat(variances(problem, scales.stated_noise))
+    stated = Stated(variance, min(power, scales.least_power), share, known)
     # k = e^{−(v/v_s)²} for other speeds v_s, first of the joints and then of the contacts
     rows, speed, theta = _at_likeliest_speed(
         whole, slice(0, nq), values[STICK_SPEED], speeds or None, theta, stated
     )
     changed = {STICK_SPEED: torch.full_like(values[STICK_NOISE], speed)}
     if tips and bool(driven.all()):
-        now, first = (torch.stack([x[tip.speed] for tip in tips]) for x in (values, found.stated_noise))
+        now, first = (torch.stack([x[tip.speed] for tip in tips]) for x in (values, scales.stated_noise))
         least = math.exp(float(first.max()))
         above = (least, *(speed for speed in speeds if speed > least)) if speeds else None
         _, speed, theta = _at_likeliest_speed(rows, slice(nq, None), now, above, theta, stated)
@@ -343,23 +347,28 @@ class Stated(NamedTuple):
 
 
 def _at_likeliest_speed(
-    whole: Residuals, own: slice, now: Tensor, speeds: Sequence[float] | None, theta: Tensor, stated: Stated
+    whole: Residuals,
+    columns: slice,
+    now: Tensor,
+    speeds: Sequence[float] | None,
+    theta: Tensor,
+    stated: Stated,
 ) -> tuple[Residuals, float, Tensor]:
     """Return the rows, log v_s and the variances θ for the likeliest speed of some joints or contacts.
 
     Args:
-        own: the columns of these joints or contacts in `slow`.
+        columns: columns of these joints or contacts in `slow`.
         now: current log v_s of each, which all share.
         speeds: speeds v_s to try, or `None` for the current one.
     """
     tried = []
     for speed in [float(now[0])] if speeds is None else map(math.log, speeds):
         slow = whole.slow.clone()
-        slow[:, own] = slow[:, own] ** (2.0 * (now - speed)).exp()
+        slow[:, columns] = slow[:, columns] ** (2.0 * (now - speed)).exp()
         rows = whole._replace(slow=slow)
         free = (torch.cat(_independent(rows, stated.power)) >= FEWEST) & ~stated.known
-        found = _settled(rows, torch.where(free, theta, stated.theta), stated.share, free)
-        tried.append((rows.log_density(*found.chunk(2)), rows, speed, found))
+        settled = _settled(rows, torch.where(free, theta, stated.theta), stated.share, free)
+        tried.append((rows.log_density(*settled.chunk(2)), rows, speed, settled))
     return max(tried, key=lambda each: each[0])[1:]
 
 
@@ -421,8 +430,8 @@ def _scored(rows: Residuals, theta: Tensor, share: Tensor, free: Tensor) -> Tens
     L = torch.linalg.cholesky(F)
     right = (F @ (theta / unit)[free] + (g * unit)[free])[:, None]
     x = torch.linalg.solve_triangular(L, right, upper=False)[:, 0]
-    found = torch.from_numpy(scipy.optimize.nnls(L.mT.cpu().numpy(), x.cpu().numpy())[0]).to(theta)
-    return torch.zeros_like(theta).masked_scatter(free, found) * unit
+    solution = torch.from_numpy(scipy.optimize.nnls(L.mT.cpu().numpy(), x.cpu().numpy())[0]).to(theta)
+    return torch.zeros_like(theta).masked_scatter(free, solution) * unit
 
 
 def exponent(

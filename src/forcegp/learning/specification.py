@@ -115,15 +115,15 @@ class Specification:
 
     def with_spread(self, spread: tuple[float, ...]) -> Specification:
         """Return the specification with the standard deviations of the scales of torques over the log."""
-        own = [prior for prior in self.priors if isinstance(prior, DrivePrior)]
+        drives = [prior for prior in self.priors if isinstance(prior, DrivePrior)]
         others = [prior for prior in self.priors if not isinstance(prior, DrivePrior)]
-        errors = (dataclasses.replace(prior, spread=spread, is_error=True) for prior in own)
+        errors = (dataclasses.replace(prior, spread=spread, is_error=True) for prior in drives)
         return dataclasses.replace(self, priors=(*others, *errors))
 
     def with_priors_of(self, problem: Problem) -> Specification:
         """Return the specification with the priors of a problem, without those that were dropped."""
-        own = {prior.name: prior for prior in self.priors}
-        return dataclasses.replace(self, priors=tuple(own.get(p.name, p) for p in problem.priors))
+        by_name = {prior.name: prior for prior in self.priors}
+        return dataclasses.replace(self, priors=tuple(by_name.get(p.name, p) for p in problem.priors))
 
     def inertia_of(self, training: Training) -> Inertia:
         """Return the inertia identified from the training samples if requested, or that of the robot file."""
@@ -135,9 +135,9 @@ class Specification:
         lacks = not any(isinstance(law, JointFrictionPrior) for law in laws)
         if lacks or not asks or any(isinstance(prior, InertialPrior) for prior in self.priors):
             return Inertia(self.system.robot)
-        found = inertia_of(self.system, laws, self.mean, training, scale, links)
+        inertia = inertia_of(self.system, laws, self.mean, training, scale, links)
         checked = training.free_motions >= LEAST or not bool(self.system.robot.driven.all())
-        return found if checked else replace(found, doubts=_unchecked_masses(training))
+        return inertia if checked else replace(inertia, doubts=_unchecked_masses(training))
 
     def problem(self, training: Training, robot: RobotModel | None = None) -> Problem:
         """Return the learning problem for training data.
@@ -177,8 +177,8 @@ def _of_recordings(
     q, qd = (robot.drive_motion(torch.cat([getattr(o.data, x) for o in observations])) for x in ("q", "qd"))
     recording = torch.cat([o.data.recording for o in observations])
     free = torch.cat([~o.data.active(o.data.contact_names).any(-1) for o in observations])
-    own = (free & (recording == recording_number(name)) for name in names)
-    offsets = OffsetPrior(names, tuple(tuple(reverses(q[rows], qd[rows])) for rows in own))
+    masks = (free & (recording == recording_number(name)) for name in names)
+    offsets = OffsetPrior(names, tuple(tuple(reverses(q[rows], qd[rows])) for rows in masks))
     return (offsets,) if any(offsets.separable) else ()
 
 
@@ -223,13 +223,13 @@ def problem_for(
     if before is not None and any(prior.is_error for prior in spec.priors):
         robot = before.system.robot
     elif before is None and chosen is None:
-        found = spec.inertia_of(training)
-        robot, doubts = found.robot, (*doubts, *found.doubts)
-        if found.spread:
-            spec = spec.with_spread(found.spread)
-        if found.errors is not None:
-            spec = dataclasses.replace(spec, priors=(*spec.priors, found.errors))
-        if found.spread or found.errors is not None:
+        inertia = spec.inertia_of(training)
+        robot, doubts = inertia.robot, (*doubts, *inertia.doubts)
+        if inertia.spread:
+            spec = spec.with_spread(inertia.spread)
+        if inertia.errors is not None:
+            spec = dataclasses.replace(spec, priors=(*spec.priors, inertia.errors))
+        if inertia.spread or inertia.errors is not None:
             training, _ = training_for(spec, before, data, chosen)
     return spec, spec.problem(dataclasses.replace(training, part_of=part_of), robot), doubts
 
