@@ -387,8 +387,8 @@ def observations_of(data: Dataset | Sequence[Observation]) -> Sequence[Observati
 
 
 def _in_time_order(observation: Observation) -> Observation:
-    found = observation.rows(in_time(observation.data.t, observation.data.segment))
-    return dataclasses.replace(found, data=found.data.in_time_order())
+    ordered = observation.rows(in_time(observation.data.t, observation.data.segment))
+    return dataclasses.replace(ordered, data=ordered.data.in_time_order())
 
 
 def states_noise(observations: Sequence[Observation]) -> bool:
@@ -574,8 +574,8 @@ def scaled(
     scales = dict(kept)
     for prior, features in [(prior, [prior.features(system, a) for a in at]) for prior in new]:
         together = {k: torch.cat([f[k] for f in features]) for k in features[0]}
-        own = Standardization.of(together, prior.vectors, prior.centred)
-        scales[prior.name] = own if standardize and prior.scaled else Standardization.none(together)
+        scale = Standardization.of(together, prior.vectors, prior.centred)
+        scales[prior.name] = scale if standardize and prior.scaled else Standardization.none(together)
     return dataclasses.replace(training, scales=tuple(scales[prior.name] for prior in priors))
 
 

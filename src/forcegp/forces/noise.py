@@ -209,16 +209,16 @@ def learned_slopes(training: Training, system: ConstrainedSystem, force: ForceFi
     return dataclasses.replace(training, slopes=slopes)
 
 
-def state_std_of(given: Sequence[NoiseStd] | None, robot: RobotModel) -> Tensor | None:
+def state_std_of(state: Sequence[NoiseStd] | None, robot: RobotModel) -> Tensor | None:
     """Return the standard deviations of q and q̇ as one vector `(2 nq,)`, or `None` if none are given.
 
     Raises:
-        ModelError: `given` is not a pair of standard deviations ≥ 0 (one number or one per joint each).
+        ModelError: `state` is not a pair of standard deviations ≥ 0 (one number or one per joint each).
     """
-    if given is None:
+    if state is None:
         return None
     try:
-        std = [torch.as_tensor(x, dtype=robot.dtype, device=robot.device).expand(robot.nq) for x in given]
+        std = [torch.as_tensor(x, dtype=robot.dtype, device=robot.device).expand(robot.nq) for x in state]
         valid = len(std) == 2 and all(bool(((x >= 0.0) & torch.isfinite(x)).all()) for x in std)
     except (TypeError, ValueError, RuntimeError):
         valid, std = False, []
@@ -226,7 +226,7 @@ def state_std_of(given: Sequence[NoiseStd] | None, robot: RobotModel) -> Tensor 
         raise ModelError(
             "the noise of the state is not valid",
             expected=f"two standard deviations, of q and q̇, each one number or {robot.nq}, 0 or above",
-            got=given,
+            got=state,
         )
     return torch.cat(std)
 

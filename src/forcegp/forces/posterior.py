@@ -280,8 +280,8 @@ class ForceSamples:
             prior, features = self.posterior.priors[p], self.posterior.process.features(p, system, at)
             parts = []
             for chunk in chunks:
-                own = {n: x[chunk.start * runs : chunk.stop * runs] for n, x in features.items()}
-                parts.append(self.functions.by_runs(p, own, chunk, runs))
+                piece = {n: x[chunk.start * runs : chunk.stop * runs] for n, x in features.items()}
+                parts.append(self.functions.by_runs(p, piece, chunk, runs))
             unknown = unknown + (prior.operator(system, at) @ torch.cat(parts)[..., None])[..., 0]
         return unknown
 

@@ -123,10 +123,10 @@ class Problem:
 
     def system_at(self, tensors: Mapping[str, Tensor]) -> ConstrainedSystem:
         """Return the system with the robot evaluated at the analytical parameters in the tensors."""
-        own = {} if self.parameters is None else analytical_parameters(tensors)
-        if self.parameters is None or not own:
+        theta = {} if self.parameters is None else analytical_parameters(tensors)
+        if self.parameters is None or not theta:
             return self.system
-        return self.system.with_robot(torch.func.functional_call(self.parameters, own, ()))
+        return self.system.with_robot(torch.func.functional_call(self.parameters, theta, ()))
 
     def noise_at(self, tensors: Mapping[str, Tensor], measurement: int) -> Tensor:
         """Return the noise `(d,)` or `(n, d)` of a measurement; learned noise scales per-sample noise."""
@@ -259,8 +259,8 @@ class Problem:
     def rows_for(self, tensors: Tensors, held: Tensors) -> WhitenedRows:
         """Return the rows for given tensors. They are cached if they do not depend on the tensors."""
         keys = [*tensors, *held]
-        own = any(key.startswith(OWN) for key in keys)
-        return self.rows({**held, **tensors}) if own else self.fixed_rows
+        depends = any(key.startswith(OWN) for key in keys)
+        return self.rows({**held, **tensors}) if depends else self.fixed_rows
 
 
 def typical(std: Tensor) -> Tensor:

@@ -198,8 +198,8 @@ def _directions(system: ConstrainedSystem, at: States) -> Tensor:
     blocks = [at.q.new_zeros(len(at.q), 0, system.m)]
     for name, rows in system.rows.items():
         if name in at.eom.contact_points:
-            own = at.eom.contact_points[name].directions(rows.stop - rows.start)
-            blocks.append(torch.nn.functional.pad(own, (rows.start, system.m - rows.stop)))
+            N = at.eom.contact_points[name].directions(rows.stop - rows.start)
+            blocks.append(torch.nn.functional.pad(N, (rows.start, system.m - rows.stop)))
     return torch.cat(blocks, dim=1)
 
 
@@ -330,8 +330,8 @@ def hidden_forces(
     R = at.eom.hidden
     part = R.diagonal(dim1=-2, dim2=-1)
     fixed, shares = part > 1.0 - ROUNDED, (part > ROUNDED) & (part <= 1.0 - ROUNDED)
-    found = [rows.reshape(-1, system.m).any(0).tolist() for rows in (unseen, fixed & ~unseen, shares)]
-    if not any(map(any, found)):
+    cases = [rows.reshape(-1, system.m).any(0).tolist() for rows in (unseen, fixed & ~unseen, shares)]
+    if not any(map(any, cases)):
         return None
     C = at.q.new_zeros(len(at.q), max(rows.stop for rows in parts.values()), system.m)
     whole = torch.zeros_like(C[..., 0], dtype=torch.bool)
@@ -340,19 +340,21 @@ def hidden_forces(
             C[:, rows], whole[:, rows] = torch.eye(system.m).to(at.q), fixed | unseen
         elif quantity == "contact_force":
             C[:, rows] = _directions(system, at)
-            own = ((C[:, rows] != 0.0) & (fixed | unseen)[:, None]).any(-1).unflatten(-1, (-1, 3))
-            whole[:, rows] = own.any(-1, keepdim=True).expand_as(own).flatten(1)
+            affected = ((C[:, rows] != 0.0) & (fixed | unseen)[:, None]).any(-1).unflatten(-1, (-1, 3))
+            whole[:, rows] = affected.any(-1, keepdim=True).expand_as(affected).flatten(1)
         elif quantity == "constraint_force":
             whole[:, rows] = unseen.any()
-    if bool(whole.all()) and any(found[0]):
+    if bool(whole.all()) and any(cases[0]):
         raise ModelError(
             OPEN[0].format(", ".join(never)),
             expected="motion in contact in the training data",
             hint="check the position of its surface (`forcegp check`), or, for forces learned in free "
             "motion, pass the system with the contact to `predict`",
         )
-    listed = (", ".join(dict.fromkeys(n for n, hit in zip(names, own, strict=True) if hit)) for own in found)
-    doubts = tuple(text.format(own) for text, own in zip(OPEN, listed, strict=True) if own)
+    listed = (
+        ", ".join(dict.fromkeys(n for n, hit in zip(names, hits, strict=True) if hit)) for hits in cases
+    )
+    doubts = tuple(text.format(contacts) for text, contacts in zip(OPEN, listed, strict=True) if contacts)
     seen = ((1.0 - part) * shares).sum(-1) * len({"multiplier", "contact_force"} & set(parts))
     shared = C @ (R * shares[..., None]) @ C.mT
     return Hidden(whole, shared, seen, doubts) if bool(whole.any() | shared.any()) else None

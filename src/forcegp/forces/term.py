@@ -107,8 +107,8 @@ class PerJointPrior(ForcePrior):
         return robot.nq
 
     def operator(self, system: ConstrainedSystem, at: States) -> Tensor:
-        own = system.robot.driven if self.needs_drive else torch.ones_like(system.robot.driven)
-        E = torch.diag(own.to(at.q))
+        driven = system.robot.driven if self.needs_drive else torch.ones_like(system.robot.driven)
+        E = torch.diag(driven.to(at.q))
         E = system.robot.joint_torque(E).mT if self.of_drives else E
         return E.expand(len(at.q), -1, -1)
 

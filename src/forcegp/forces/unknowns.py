@@ -101,12 +101,12 @@ def stated_tips(system: ConstrainedSystem, states: Iterable[States]) -> dict[str
     their common tangential force is that of one contact. v_s is at least `REACH` times the standard deviation
     of the speed along the normal.
     """
-    found, loads, normal = {}, list[tuple[Tensor, Tensor]](), dict[str, list[Tensor]]()
+    tips, loads, normal = {}, list[tuple[Tensor, Tensor]](), dict[str, list[Tensor]]()
     for at in states:
-        own = 1.0 - at.eom.hidden.diagonal(dim1=-2, dim2=-1)
+        part = 1.0 - at.eom.hidden.diagonal(dim1=-2, dim2=-1)
         force = at.eom.multiplier(at.eom.Q_K + at.tau).clamp(min=0.0)
         loads.append(
-            (at.active, torch.where(own > DETERMINED, force / own.clamp(min=DETERMINED).sqrt(), 0.0))
+            (at.active, torch.where(part > DETERMINED, force / part.clamp(min=DETERMINED).sqrt(), 0.0))
         )
         for name, closed in zip(system.contact_names, at.active.unbind(-1), strict=True):
             if (point := at.eom.contact_points.get(name)) is not None:
@@ -120,5 +120,5 @@ def stated_tips(system: ConstrainedSystem, states: Iterable[States]) -> dict[str
             speed = REACH * MAD_TO_STD * float(torch.cat(normal[name]).abs().median())
             stated = RELATIVE * s, s, max(STICKING, speed)
             values = (system.robot.mass.new_tensor(math.log(x)) for x in stated)
-            found |= dict(zip(tip_keys(name), values, strict=True))
-    return found
+            tips |= dict(zip(tip_keys(name), values, strict=True))
+    return tips

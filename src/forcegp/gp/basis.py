@@ -275,8 +275,8 @@ class LatentBasis:
                 raise KeyError(f"{p}.inducing")
             saved = [sub(tensors, f"{p}.{k}") for k in range(components if f"{p}.0.values" in tensors else 0)]
             spectra = tuple(Spectrum(s["values"], s["vectors"], int(s["dropped"])) for s in saved)
-            own = sub(params, process.prefix)
-            parts.append(ProcessBasis(process.kernel, own, components, inducing, spectra))
+            process_params = sub(params, process.prefix)
+            parts.append(ProcessBasis(process.kernel, process_params, components, inducing, spectra))
         return cls(tuple(processes), dict(params), tuple(parts))
 
     def of_process(self, p: int) -> slice:

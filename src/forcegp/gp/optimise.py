@@ -250,8 +250,8 @@ def _adam(
     tensors = {key: value.detach().clone() for key, value in start.items()}
     rates = {False: options.learning_rate, True: options.analytical_learning_rate}
     optimizer = torch.optim.Adam(
-        {"params": [x for key, x in tensors.items() if (key in analytical) == own], "lr": rate}
-        for own, rate in rates.items()
+        {"params": [x for key, x in tensors.items() if (key in analytical) == is_analytical], "lr": rate}
+        for is_analytical, rate in rates.items()
     )
     since = 0
     for _ in range(options.max_evaluations):

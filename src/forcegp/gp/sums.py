@@ -183,10 +183,10 @@ def _groups(basis: LatentBasis, block: Block) -> tuple[_Group, ...]:
     for p, W in enumerate(block.operators):
         same.setdefault(id(W), []).append(p)
     groups = []
-    for own in same.values():
-        if bool(block.operators[own[0]].any()):
-            width = sum(basis.parts[p].used.shape[1] for p in own)
-            groups.append(_Group(tuple(own), basis.parts[own[0]].components, width))
+    for processes in same.values():
+        if bool(block.operators[processes[0]].any()):
+            width = sum(basis.parts[p].used.shape[1] for p in processes)
+            groups.append(_Group(tuple(processes), basis.parts[processes[0]].components, width))
     return tuple(sorted(groups, key=lambda group: group.width <= FEW))
 
 
@@ -211,11 +211,11 @@ class _Arranged:
         """Return the sums over no samples."""
         each = [torch.arange(0)]
         for group in groups:
-            own = [torch.full(basis.parts[p].used.shape, -1) for p in group.processes]
-            for at, p in zip(own, group.processes, strict=True):
+            places = [torch.full(basis.parts[p].used.shape, -1) for p in group.processes]
+            for at, p in zip(places, group.processes, strict=True):
                 columns = basis.of_process(p)
                 at[basis.parts[p].used] = torch.arange(columns.start, columns.stop)
-            each.append(torch.cat(own, dim=1).flatten())
+            each.append(torch.cat(places, dim=1).flatten())
         at = torch.cat(each).to(like.device)
         return cls(groups, at, like.new_zeros(len(at), len(at)), like.new_zeros(len(at)))
 

@@ -112,8 +112,8 @@ class OffsetPrior(JointTerm):
         moves = [*(self.moves or [every] * len(self.recordings)), every]
         each = zip((*self.recordings, ""), shares(self.recordings, x.recording), moves, strict=True)
         return {
-            f"offset_{name}" if name else "offset": (zero + share) * constants(x.qd, every * own)
-            for name, share, own in each
+            f"offset_{name}" if name else "offset": (zero + share) * constants(x.qd, every * moving)
+            for name, share, moving in each
         }
 
     @property
@@ -122,8 +122,8 @@ class OffsetPrior(JointTerm):
         return [sum(column) > 1 for column in zip(*self.moves, strict=True)] or [True]
 
     def stated(self, initial: dict[str, Tensor]) -> dict[str, Tensor]:
-        own = math.log(OFFSET) + 0.5 * math.log(1 + len(self.recordings))
-        return {name: value + own for name, value in initial.items()}
+        log_scale = math.log(OFFSET) + 0.5 * math.log(1 + len(self.recordings))
+        return {name: value + log_scale for name, value in initial.items()}
 
 
 def shares(recordings: Sequence[str], numbers: Tensor | None) -> Sequence[Tensor | float]:
@@ -135,8 +135,8 @@ def shares(recordings: Sequence[str], numbers: Tensor | None) -> Sequence[Tensor
     """
     if numbers is None:
         return [*(0.0 for _ in recordings), 1.0]
-    own = [(numbers == recording_number(name)).double() for name in recordings]
-    return [*own, 1.0 - sum(own)]
+    matches = [(numbers == recording_number(name)).double() for name in recordings]
+    return [*matches, 1.0 - sum(matches)]
 
 
 @dataclass(frozen=True)

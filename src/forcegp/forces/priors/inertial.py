@@ -157,8 +157,8 @@ class InertialPrior(ConstantForcePrior):
         links = (torch.linalg.eigvalsh(J0)[:, 0] > 0.0).nonzero()[:, 0]
         if not len(links):
             return robot, torch.zeros_like(mean)
-        own = (PER_LINK * links[:, None] + torch.arange(PER_LINK).to(links)).flatten()
-        P, r, scale = (x[own].double() for x in (precision[:, own], precision @ mean, self.scale(robot)))
+        index = (PER_LINK * links[:, None] + torch.arange(PER_LINK).to(links)).flatten()
+        P, r, scale = (x[index].double() for x in (precision[:, index], precision @ mean, self.scale(robot)))
         E = pseudo_inertia_of(scale.view(-1, PER_LINK, 1) * torch.eye(PER_LINK).to(scale))
 
         def robot_of(J: Tensor) -> RobotModel:
@@ -174,7 +174,7 @@ class InertialPrior(ConstantForcePrior):
                 return float(V.detach()), torch.autograd.grad(V, x)[0]
 
         x, J = _most_probable(P, r, J0[links], E, volume, DIVERGENCE if weight is None else weight)
-        return robot_of(J), torch.zeros_like(mean).index_put((own,), x.to(mean))
+        return robot_of(J), torch.zeros_like(mean).index_put((index,), x.to(mean))
 
 
 def _change(x: Tensor, E: Tensor) -> Tensor:

@@ -141,9 +141,9 @@ def _followed(t: Tensor, qd: Tensor, segment: Tensor, begin: Tensor | None = Non
         b[lag:] = b[lag:] + a[lag:] * b[:-lag].clone()
         a[lag:] = a[lag:] * a[:-lag].clone()
         lag *= 2
-    left = torch.exp(-(travel[..., None] / delta).clamp(max=300.0))
+    decay = torch.exp(-(travel[..., None] / delta).clamp(max=300.0))
     if unknown is not None:
-        left = torch.where((number == 0)[:, None, None], left * unknown, left)
+        decay = torch.where((number == 0)[:, None, None], decay * unknown, decay)
     result = torch.empty(*qd.shape, 2 * len(DISTANCES), dtype=qd.dtype, device=qd.device)
-    result[order] = torch.cat([b, left], dim=-1)
+    result[order] = torch.cat([b, decay], dim=-1)
     return result

@@ -78,9 +78,9 @@ def ripple_of(q: Tensor, residual: Tensor) -> RipplePrior | None:
 
 def waves_of(q: Tensor, residual: Tensor) -> tuple[float, ...]:
     """Return the wave numbers of the ripple of one joint, the strongest first; see `ripple_of`."""
-    reach, waves, left = float(q.max() - q.min()), [], _without(q, residual, [])
+    reach, waves, remaining = float(q.max() - q.min()), [], _without(q, residual, [])
     while len(waves) < MOST_WAVES and reach > 0.0:
-        k, power = _periodogram(q, left, reach)
+        k, power = _periodogram(q, remaining, reach)
         known, width = torch.tensor([abs(wave) for wave in waves]).to(k), 2.0 * math.pi / reach
         # Everything else is a side lobe of a line, or the slope of a smooth function.
         fresh = ((k[:, None] - known).abs() > width).all(-1) & _is_highest(power)
@@ -89,11 +89,11 @@ def waves_of(q: Tensor, residual: Tensor) -> tuple[float, ...]:
         i = int(excess.argmax())
         if float(excess[i]) < math.log(len(k) / OVERSAMPLING) + CERTAIN:
             break
-        waves.append(_refined(q, left, float(k[i]), reach))
+        waves.append(_refined(q, remaining, float(k[i]), reach))
         # A wave shifts the estimates of the others, so each is refined again without the others.
         for m, wave in enumerate(waves[:-1]):
             waves[m] = _refined(q, _without(q, residual, waves[:m] + waves[m + 1 :]), wave, reach)
-        left = _without(q, residual, waves)
+        remaining = _without(q, residual, waves)
     return tuple(waves)
 
 
