@@ -118,10 +118,10 @@ class Calibration:
     @property
     def losses(self) -> tuple[str, ...]:
         """Learned forces that a robot file cannot represent, described by one sentence per joint."""
-        left, offset = (x.round(decimals=9).tolist() for x in (self.left, self.offset))  # no rounding errors
+        rms, offset = (x.round(decimals=9).tolist() for x in (self.left, self.offset))  # no rounding errors
         texts = "friction beyond that of the file of {:.3g} (root mean square)", "a constant force of {:.3g}"
         sentences = []
-        for joint, *sizes in zip(self.robot.joint_names, left, offset, strict=True):
+        for joint, *sizes in zip(self.robot.joint_names, rms, offset, strict=True):
             parts = [text.format(size) for text, size in zip(texts, sizes, strict=True) if size]
             sentences += [f"joint {joint!r}: {' and '.join(parts)} (N m or N)"] if parts else []
         return tuple(sentences)
@@ -154,8 +154,8 @@ def calibrated(
     reader = _Reader.of(fit, seed, gain_std=gain_std)
     (mean, *samples), laws = reader.robots(draws, mjcf)
     file = fit.specified.robot
-    robot, (curve, left, offset) = mean
-    curves = torch.stack([found for _, (found, _, _) in samples])
+    robot, (curve, residual, offset) = mean
+    curves = torch.stack([sampled for _, (sampled, _, _) in samples])
     # Scales remain those that instruments found, and undetermined ones nominal.
     robot = robot.replace(torque_scale=fit.system.robot.torque_scale)
     robots = [each for each, _ in samples]
@@ -164,7 +164,7 @@ def calibrated(
     levels, std = (
         torch.stack(each).to(curve) for each in zip(*((x[0], x[1:].std(0)) for x in dry), strict=True)
     )
-    return Calibration(robot, parameters, reader.speeds, curve, curves.std(0), left, offset, levels, std)
+    return Calibration(robot, parameters, reader.speeds, curve, curves.std(0), residual, offset, levels, std)
 
 
 @torch.no_grad()
@@ -227,41 +227,41 @@ def write_calibrated(
     for path in results:
         check_destination(path)
     mjcf = is_mjcf(source)
-    found = calibrated(fit, seed=seed, gain_std=gain_std, mjcf=mjcf)
+    calibration = calibrated(fit, seed=seed, gain_std=gain_std, mjcf=mjcf)
     drawn = sampled_robots(fit, samples, seed=seed, gain_std=gain_std, mjcf=mjcf) if samples else []
-    robots = [found.robot, *drawn]
-    drives = not mjcf and bool((found.robot.armature != 0.0).any())
+    robots = [calibration.robot, *drawn]
+    drives = not mjcf and bool((calibration.robot.armature != 0.0).any())
     losses: tuple[str, ...] = ()
     for robot, path in zip(robots, paths, strict=True):
-        holding = without_armature(robot, found.speeds[-1]) if drives else robot
+        holding = without_armature(robot, calibration.speeds[-1]) if drives else robot
         losses = losses or write_robot(holding, source, path, locked_joints=locked_joints).losses
     if drives:
-        values = ", ".join(f"{x:.4g}" for x in found.robot.armature.tolist())
+        values = ", ".join(f"{x:.4g}" for x in calibration.robot.armature.tolist())
         losses = (
             f"URDF has no armature ({values}): the links include its inertia as far as physically possible",
             *losses,
         )
     report = {
-        "parameters": [vars(parameter) for parameter in found.parameters],
-        "losses": [*losses, *found.losses],
+        "parameters": [vars(parameter) for parameter in calibration.parameters],
+        "losses": [*losses, *calibration.losses],
         "dry_friction": {
             joint: {
-                name: {"value": float(found.levels[k, j]), "std": float(found.levels_std[k, j])}
+                name: {"value": float(calibration.levels[k, j]), "std": float(calibration.levels_std[k, j])}
                 for k, name in enumerate(("static", "dynamic"))
             }
-            for j, joint in enumerate(found.robot.joint_names)
+            for j, joint in enumerate(calibration.robot.joint_names)
         },
         "friction": {
             joint: {
-                "speed": found.speeds[:, j].tolist(),
-                "force": found.friction[:, j].tolist(),
-                "std": found.friction_std[:, j].tolist(),
+                "speed": calibration.speeds[:, j].tolist(),
+                "force": calibration.friction[:, j].tolist(),
+                "std": calibration.friction_std[:, j].tolist(),
             }
-            for j, joint in enumerate(found.robot.joint_names)
+            for j, joint in enumerate(calibration.robot.joint_names)
         },
     }
     write_json(page, report)
-    return found
+    return calibration
 
 
 def written_files(out: Path, samples: int) -> list[Path]:
@@ -290,28 +290,28 @@ def unknowns_after(fit: StructuredFit, unknowns: Unknowns, *, draws: int = DRAWS
     drawn = fit.force_samples(draws, torch.Generator().manual_seed(seed))
     assert isinstance(drawn, ForceSamples)
     nq, links = unknowns.robot.nq, unknowns.base.rank
-    found: dict[int, Tensor] = {}
+    deviations: dict[int, Tensor] = {}
     delta = reader.speeds.new_zeros(draws, nq * len(MOMENTS))
     prior = next((p for p in fit.force_priors if isinstance(p, InertialPrior)), None)
     if prior is not None:
         errors = reader._constants(drawn, InertialPrior)[1:] * prior.scale(unknowns.robot)
         delta += errors[:, : delta.shape[1]]
-        found |= dict(enumerate(errors[:, delta.shape[1] :].mT, unknowns.parts["drives"].start))
+        deviations |= dict(enumerate(errors[:, delta.shape[1] :].mT, unknowns.parts["drives"].start))
     for payload in (p for p in fit.force_priors if isinstance(p, PayloadPrior)):
         first = len(MOMENTS) * payload.link(unknowns.robot)
         load = reader._constants(drawn, PayloadPrior)[1:] * payload.units(delta)
         delta[:, first : first + load.shape[1]] += load
     if prior is not None:
-        found |= dict(enumerate((delta @ torch.from_numpy(unknowns.base.combination).mT).mT))
+        deviations |= dict(enumerate((delta @ torch.from_numpy(unknowns.base.combination).mT).mT))
     if any(isinstance(prior, JointTerm) for prior in fit.force_priors):
         curves = reader._curves(drawn)[1:]
         basis = unknowns.basis(torch.zeros_like(reader.speeds), reader.speeds)
         spread, each = (curves - curves.mean(0)).permute(2, 1, 0), basis.shape[-1]
         weights = torch.linalg.pinv(basis[..., :-PLACES].movedim(1, 0)) @ spread
-        found |= {links + each * j + k: w for j in range(nq) for k, w in enumerate(weights[j])}
-    if not found:
+        deviations |= {links + each * j + k: w for j in range(nq) for k, w in enumerate(weights[j])}
+    if not deviations:
         return unknowns
-    rows, samples = list(found), torch.stack(list(found.values()))
+    rows, samples = list(deviations), torch.stack(list(deviations.values()))
     covariance, root = torch.cov(samples), unknowns.root.clone()
     jitter = JITTER * torch.diag(root[rows].square().sum(-1))
     root[rows] = 0.0
@@ -405,14 +405,14 @@ class _Reader:
         spread = free[: 1 + draws] + 0.5 * (along - 1.0) * b
         curves, *others = self._consistent(spread, sizes[0], free[1:]).split(sizes, dim=-1)
         rows = zip(curves.unflatten(1, self.speeds.shape), *others[:3], strict=True)
-        found = [self._robot(*row) for row in rows]
+        robots = [self._robot(*row) for row in rows]
         # Friction resists, −Q.
         resisting = [-part.unflatten(1, (-1, self.speeds.shape[-1])) for part in others[3:]]
         laws = laws_of(reversals, *resisting)
         if mjcf:
             written = laws if laws.has_memory.all() else laws_of(reversals, *resisting, static=False)
-            found = self._with_laws(found, written)
-        return found, laws
+            robots = self._with_laws(robots, written)
+        return robots, laws
 
     def _reversing(self, drawn: ForceSamples, at: Reversals) -> tuple[list[Tensor], list[Tensor]]:
         """Return the arguments of `laws_of` as forces Q, and for each the difference of the identified
@@ -431,15 +431,15 @@ class _Reader:
             apart.append(-self._from_mean(p, features).flatten()[None])
         return forces, apart
 
-    def _with_laws(self, found: list[tuple[RobotModel, Curve]], laws: Laws) -> list[tuple[RobotModel, Curve]]:
+    def _with_laws(self, drawn: list[tuple[RobotModel, Curve]], laws: Laws) -> list[tuple[RobotModel, Curve]]:
         """Return the robots with laws of friction, of joints with memory or with polynomial damping."""
         values = torch.from_numpy(laws.values).to(self.speeds)
         bristle, drag = values[..., 6], values[..., 1:3]
         has_law = (bristle[0] > 0.0) | (drag[0] != 0.0).any(-1)
         if not bool(has_law.any()):
-            return found
+            return drawn
         robots = []
-        for (robot, (curve, left, offset)), law in zip(found, values, strict=True):
+        for (robot, (curve, residual, offset)), law in zip(drawn, values, strict=True):
             d, _, _, f, s, speed, stiffness = law.unbind(-1)
             robot = robot.replace(
                 damping=torch.where(has_law, d, robot.damping),
@@ -449,8 +449,8 @@ class _Reader:
                 stribeck_velocity=torch.where(s * has_law > 0.0, speed, robot.stribeck_velocity),
                 bristle=torch.where(stiffness > 0.0, stiffness, per_joint(robot, "bristle")),
             )
-            left = torch.where(has_law, torch.from_numpy(laws.left).to(left), left)
-            robots.append((robot, (curve, left, offset)))
+            residual = torch.where(has_law, torch.from_numpy(laws.left).to(residual), residual)
+            robots.append((robot, (curve, residual, offset)))
         return robots
 
     def _disagreement(self) -> Tensor:
@@ -588,7 +588,7 @@ class _Reader:
         if drives is not None:
             known = torch.ones_like(scale) if robot.torque_scale is None else robot.torque_scale
             robot = robot.replace(torque_scale=known * (1.0 + drives.std * scale))
-        damping, friction, left, offset = _projected(self.speeds, curve)
+        damping, friction, residual, offset = _projected(self.speeds, curve)
         robot = robot.replace(damping=damping, friction=friction, stribeck=0.0 * friction, drag=None)
         if self.scale is not None:
             links, drives = delta.split([robot.nq * len(MOMENTS), delta.numel() - robot.nq * len(MOMENTS)])
@@ -599,7 +599,7 @@ class _Reader:
         prior = next((p for p in self.fit.force_priors if isinstance(p, PayloadPrior)), None)
         if prior is not None:
             robot = prior.around(load).loaded(robot)
-        return robot, (curve, left, offset)
+        return robot, (curve, residual, offset)
 
 
 def _scale_of(precision: Tensor, n: int) -> Tensor:
@@ -621,13 +621,13 @@ def _offset_gain(offset: Tensor, mean: Tensor, values: Tensor) -> Tensor:
 
 def _projected(speeds: Tensor, curve: Tensor) -> tuple[Tensor, ...]:
     """Return damping d, dry friction f, residual, and offset c of each joint, `(nq,)`."""
-    found = []
+    coefficients = []
     for v, force in zip(speeds.T.cpu().numpy(), curve.T.cpu().numpy(), strict=True):
         # −Q_D = d v + f sign v − c
         X = np.stack([v, np.sign(v), -np.ones_like(v)], axis=1)
         fitted = lsq_linear(X, -force, bounds=([0.0, 0.0, -np.inf], np.inf))
-        found.append(np.array([*fitted.x[:2], np.sqrt(np.mean(fitted.fun**2)), fitted.x[2]]))
-    return torch.from_numpy(np.stack(found, axis=1)).to(curve).unbind()
+        coefficients.append(np.array([*fitted.x[:2], np.sqrt(np.mean(fitted.fun**2)), fitted.x[2]]))
+    return torch.from_numpy(np.stack(coefficients, axis=1)).to(curve).unbind()
 
 
 def _moved(robot: RobotModel, change: Tensor) -> RobotModel:

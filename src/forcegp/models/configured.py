@@ -105,15 +105,17 @@ def configured(
 def keys_of(kind: type[Model[Any]]) -> tuple[str, ...]:
     """Return the keys of `[model]` for a model class: the common keys and the constructor arguments."""
     keys = {argument: key for key, argument in ARGUMENTS.items()}
-    own = [keys.get(name, name) for name in signature(kind).parameters if name not in ("system", *COMMON)]
-    return (*COMMON, *own, *(("sensor_noise_std",) if kind is StructuredGP else ()))
+    arguments = [
+        keys.get(name, name) for name in signature(kind).parameters if name not in ("system", *COMMON)
+    ]
+    return (*COMMON, *arguments, *(("sensor_noise_std",) if kind is StructuredGP else ()))
 
 
 def _arguments(table: ModelTable, system: ConstrainedSystem, name: str) -> dict[str, Any]:
     """Return the arguments for the model class that are defined in the table."""
     made, at = MODELS[name].made, table.document.at
-    given, arguments = table.section.given(), dict[str, Any]()
-    for key, value in given.items():
+    entries, arguments = table.section.given(), dict[str, Any]()
+    for key, value in entries.items():
         _check_key(table, ("model", key), keys_of(made), f"the model {name!r}")
         if key == "mean" and not isinstance(value, str):
             value = at(("model", "mean"), AnalyticalMean, value)
@@ -129,11 +131,11 @@ def _arguments(table: ModelTable, system: ConstrainedSystem, name: str) -> dict[
 
 def _noise(section: NoiseSection, acceleration: NoiseStd | None) -> NoiseStd | Noise | None:
     """Return the noise defined in `[model]`. If given, `acceleration` overrides the acceleration noise."""
-    given = section.given() | ({} if acceleration is None else {"acceleration": acceleration})
-    if set(given) <= {"acceleration"}:
-        return given.get("acceleration")
-    torque = given.get("torque", "auto")
-    return Noise(**{**given, "torque": None if torque == "none" else torque})
+    stated = section.given() | ({} if acceleration is None else {"acceleration": acceleration})
+    if set(stated) <= {"acceleration"}:
+        return stated.get("acceleration")
+    torque = stated.get("torque", "auto")
+    return Noise(**{**stated, "torque": None if torque == "none" else torque})
 
 
 def _priors(table: ModelTable, written: Sequence[dict[str, Any]]) -> tuple[ForcePrior, ...]:
@@ -155,24 +157,24 @@ def _priors(table: ModelTable, written: Sequence[dict[str, Any]]) -> tuple[Force
 
 def _learning(table: ModelTable, model: Model[Any]) -> Options | None:
     """Return the options defined in `[model.learning]`, with defaults of the model for missing keys."""
-    given: dict[str, Any] = table.section.learning.given()
-    if not given:
+    options: dict[str, Any] = table.section.learning.given()
+    if not options:
         return None
-    if given.get("warm_start") is False:
-        given["warm_start"] = None
-    default = _default(model, given)
+    if options.get("warm_start") is False:
+        options["warm_start"] = None
+    default = _default(model, options)
     known = [field.name for field in dataclasses.fields(default)]
-    for key in given:
+    for key in options:
         what = f"learning a {model.kind} model by {type(default).__name__}"
         _check_key(table, ("model", "learning", key), known, what)
-    return table.document.at(("model", "learning"), type(default), **{**vars(default), **given})
+    return table.document.at(("model", "learning"), type(default), **{**vars(default), **options})
 
 
-def _default(model: Model[Any], given: Mapping[str, Any]) -> Options:
+def _default(model: Model[Any], options: Mapping[str, Any]) -> Options:
     """Return the default options of a model. For an analytical model, the given keys select their class."""
     if isinstance(model, NeuralNetwork):
         return DEEP if len(model.hidden) > 2 else SHALLOW
-    if isinstance(model, AnalyticalModel) and not {"optimizer", "max_evaluations"} & set(given):
+    if isinstance(model, AnalyticalModel) and not {"optimizer", "max_evaluations"} & set(options):
         return ADAM
     if isinstance(model, StructuredGP) and model.specification.analytical_parameters is not None:
         return WITH_PARAMETERS

@@ -141,9 +141,9 @@ class _Joint:
         place = self.phase / np.pi * PHASES
         low = np.minimum(place.astype(int), PHASES - 1)
         for m, level in enumerate(LEVELS):
-            own = self.level == level
-            before, after = path[:, m, low[own]], path[:, m, low[own] + 1]
-            at[:, own] = before + (place - low)[own] * (after - before)
+            at_level = self.level == level
+            before, after = path[:, m, low[at_level]], path[:, m, low[at_level] + 1]
+            at[:, at_level] = before + (place - low)[at_level] * (after - before)
         return at * np.sign(self.v)
 
     def powers(self, curved: bool) -> Array:
@@ -162,7 +162,7 @@ class _Joint:
         if not free.any():
             return 0.0, 0.0, 1.0
 
-        def left(x: Array) -> Array:
+        def residual(x: Array) -> Array:
             """Return what the laws with logarithms x `(g, k)` leave of the friction, `(g, n)`."""
             shape = np.tile([0.0, 0.0, 1.0], (len(x), 1))
             shape[:, free] = np.exp(x)
@@ -171,11 +171,11 @@ class _Joint:
             return rest - np.maximum(bend @ rest, 0.0)[:, None] / (bend**2).sum(-1, keepdims=True) * bend
 
         grid = np.array(list(product(*(np.linspace(low, high, GRID) for low, high in ranges[free]))))
-        start = grid[(left(grid) ** 2).sum(-1).argmin()]
+        start = grid[(residual(grid) ** 2).sum(-1).argmin()]
         bounds = tuple((ranges[free] + [-WIDER, WIDER]).T)
-        found = np.array([0.0, 0.0, 1.0])
-        found[free] = np.exp(least_squares(lambda x: left(x[None])[0], start, bounds=bounds).x)
-        return tuple(found.tolist())
+        parameters = np.array([0.0, 0.0, 1.0])
+        parameters[free] = np.exp(least_squares(lambda x: residual(x[None])[0], start, bounds=bounds).x)
+        return tuple(parameters.tolist())
 
     def law(self, y: Array, bends: bool, curved: bool, peaked: bool) -> tuple[Array, float]:
         """Return the closest law to friction y `(n,)`, and the RMS of what it does not explain."""
@@ -256,7 +256,7 @@ def laws_of(at: Reversals, sliding: Tensor, memory: Tensor | None = None, *, sta
     Returns:
         The laws. A joint has memory if its RMS is above two standard deviations.
     """
-    laws, left = [], []
+    laws, residuals = [], []
     for j in range(sliding.shape[-1]):
         joint, y, bends = _Joint(at, j), sliding[:, at.index, j].cpu().numpy(), False
         if memory is not None:
@@ -264,15 +264,15 @@ def laws_of(at: Reversals, sliding: Tensor, memory: Tensor | None = None, *, sta
             past = np.concatenate([-past, past], axis=1)
             bends = _rms(past[0]) > OPEN * _rms(past[1:] - past[0])
             y = y + past if bends else y
-        found = []
+        candidates = []
         for curved, peaked in product((False, True), repeat=2):
             if static or bends or not peaked:
                 law, rest = joint.law(y[0], bends, curved, peaked)
                 samples = joint.sampled(law, y, bends, curved, peaked)
                 extra = [*((1, 2) if curved else ()), *((4,) if peaked else ())]
                 if _distance(law[extra], samples[:, extra]) > OPEN or not extra:
-                    found.append((rest, np.concatenate([law[None], samples])))
-        rest, values = min(found, key=lambda each: each[0])
+                    candidates.append((rest, np.concatenate([law[None], samples])))
+        rest, values = min(candidates, key=lambda each: each[0])
         laws.append(values)
-        left.append(rest)
-    return Laws(np.stack(laws, axis=1), np.array(left))
+        residuals.append(rest)
+    return Laws(np.stack(laws, axis=1), np.array(residuals))

@@ -72,10 +72,10 @@ def _restored(
 ) -> FittedModel:
     """Restore a model from its header and tensors."""
     check_name(f"kind of models in {source}", header.kind, KINDS)
-    own = {name: value for name, value in tensors.items() if not name.startswith(PREFIX)}
+    model_tensors = {name: value for name, value in tensors.items() if not name.startswith(PREFIX)}
     try:
         model_system = unpack_system(header.system, tensors, source, system)
-        model = KINDS[header.kind].restored(header, own, model_system, source)
+        model = KINDS[header.kind].restored(header, model_tensors, model_system, source)
         _check(model)
         return model
     except ForceGPError:

@@ -55,15 +55,15 @@ def parameter_std(problem: Problem, hyperparameters: Mapping[str, Tensor]) -> di
         return torch.autograd.grad(value, leaf)[0]
 
     def robot(x: Tensor) -> RobotModel:
-        own = {name.removeprefix(f"{ANALYTICAL}."): value for name, value in named(x).items()}
-        return torch.func.functional_call(theta, own, ())
+        values = {name.removeprefix(f"{ANALYTICAL}."): value for name, value in named(x).items()}
+        return torch.func.functional_call(theta, values, ())
 
     x = torch.cat([value.flatten() for value in places.values()])
     steps = STEP * torch.eye(len(x)).to(x)
     H = torch.stack([gradient(x + step) - gradient(x - step) for step in steps]) / (2.0 * STEP)
     w, V = torch.linalg.eigh(0.5 * (H + H.mT))
     known = w > LEAST * w.max().clamp(min=1e-300)
-    found = {}
+    std = {}
     for field in dict.fromkeys(
         name for quantity in theta.joints for name in FIELDS.get(quantity, (quantity,))
     ):
@@ -72,5 +72,5 @@ def parameter_std(problem: Problem, hyperparameters: Mapping[str, Tensor]) -> di
         along = (J @ V).square()
         variance = (along[..., known] / w[known]).sum(-1)
         lost = along[..., ~known].sum(-1) > LEAST * along.sum(-1)
-        found[field] = variance.sqrt().masked_fill(lost, torch.inf)
-    return found
+        std[field] = variance.sqrt().masked_fill(lost, torch.inf)
+    return std

@@ -68,14 +68,14 @@ def learned_parameters(
         return ()
     inverse = torch.linalg.solve_triangular(latent.L, torch.eye(len(latent.L)).to(latent.L), upper=False)
     apart = latent.joint_weights - latent.weights if is_identified(posterior.priors) else 0.0
-    deviation, found = (inverse.square().sum(0) + apart**2).sqrt(), []
+    deviation, parameters = (inverse.square().sum(0) + apart**2).sqrt(), []
     for p, part in enumerate(latent.basis.parts):
         if part.split.rest is None:
-            own = latent.basis.of_process(p)
+            columns = latent.basis.of_process(p)
             shape = part.components, -1
-            rows = latent.weights[own].view(shape), deviation[own].view(shape)
-            found += _of_prior(posterior, hyperparameters, robot, p, *rows)
-    return tuple(found)
+            rows = latent.weights[columns].view(shape), deviation[columns].view(shape)
+            parameters += _of_prior(posterior, hyperparameters, robot, p, *rows)
+    return tuple(parameters)
 
 
 def _of_prior(

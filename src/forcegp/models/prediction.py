@@ -275,9 +275,9 @@ class Predictor(ForwardModel):
         parts, doubts = dict[str, slice](), dict[str, None]()
 
         def read(flat: FlatStates) -> tuple[Tensor | None, ...]:
-            values, slices, own = self.at(flat, query)
+            values, slices, descriptions = self.at(flat, query)
             parts.update(slices)
-            doubts.update(dict.fromkeys(own))
+            doubts.update(dict.fromkeys(descriptions))
             return values
 
         mean, spread, beyond, determined = in_pieces(flat, read)

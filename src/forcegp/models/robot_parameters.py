@@ -87,13 +87,13 @@ def robot_parameters(
         training: the training samples.
         file, system: the robot of the file, and the identified robot with its contacts.
     """
-    found = [*_of_robot(posterior, columns, file, system.robot)]
+    parameters = [*_of_robot(posterior, columns, file, system.robot)]
     if isinstance(posterior.latent, SparsePosterior) and training.samples:
         weights = _Weights.of(posterior.latent, is_identified(posterior.priors))
         states = [m.at(system) for m in training.evenly(SAMPLES).measurements]
-        found = [*_of_joints(weights, posterior, system, states), *found]
-        found += _of_contacts(weights, posterior, friction, system, states)
-    return tuple(found)
+        parameters = [*_of_joints(weights, posterior, system, states), *parameters]
+        parameters += _of_contacts(weights, posterior, friction, system, states)
+    return tuple(parameters)
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,8 +141,8 @@ def _of_joints(
             within = moves & (size >= low) & (size <= high)
             ahead, back = within & (v > 0.0), within & (v < 0.0)
             if min(int(ahead.sum()), int(back.sum())) >= FEWEST:
-                K, own = (0.5 * (x[ahead].mean(0) - x[back].mean(0)) for x in (Phi, known))
-                value, std, determined = weights.estimate(K, float(own))
+                K, known_force = (0.5 * (x[ahead].mean(0) - x[back].mean(0)) for x in (Phi, known))
+                value, std, determined = weights.estimate(K, float(known_force))
                 speed = 0.5 * float(size[ahead].mean() + size[back].mean())
                 yield RobotParameter(name, joint, value, std, unit, determined, speed)
         P = torch.linalg.pinv(torch.stack([v, v.sign(), torch.ones_like(v)], dim=-1)[moves])[2]

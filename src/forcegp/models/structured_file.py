@@ -131,14 +131,16 @@ def pack(
     Raises:
         ModelError: a prior or kernel is defined in Python.
     """
-    own = spec.analytical_parameters if isinstance(spec.analytical_parameters, AnalyticalParameters) else None
-    tensors = {f"hyper.{key}": value for key, value in _kept(hyperparameters, own).items()}
+    theta = (
+        spec.analytical_parameters if isinstance(spec.analytical_parameters, AnalyticalParameters) else None
+    )
+    tensors = {f"hyper.{key}": value for key, value in _kept(hyperparameters, theta).items()}
     if problem.torque_std is not None:
         tensors["torque_std"] = problem.torque_std
     if problem.correlation is not None:
         tensors["torque_correlation"] = problem.correlation
     tensors |= _conditioned_on(spec, problem.training, posterior)
-    start = own.start if own is not None else spec.system.robot
+    start = theta.start if theta is not None else spec.system.robot
     tensors |= {f"start.{name}": value for name, value in start.tensors.items()}
     for prior, scale in zip(spec.priors, problem.training.scales, strict=True):
         tensors |= {f"scale.{prior.name}.mean.{key}": value for key, value in scale.mean.items()}
@@ -154,7 +156,7 @@ def pack(
         priors=tuple(encode(prior, classes()) for prior in problem.priors),
         measured=problem.training.quantities if isinstance(posterior.latent, ExactPosterior) else (),
         constant=tuple(scale.constant for scale in problem.training.scales),
-        analytical_parameters=None if own is None else own.joints,
+        analytical_parameters=None if theta is None else theta.joints,
         result=result,
     )
     return settings, tensors
@@ -182,9 +184,9 @@ def _columns(spec: Specification) -> tuple[str, ...]:
     return (*COLUMNS, "recording") if several else COLUMNS
 
 
-def _kept(hyper: Mapping[str, Tensor], own: AnalyticalParameters | None) -> dict[str, Tensor]:
+def _kept(hyper: Mapping[str, Tensor], theta: AnalyticalParameters | None) -> dict[str, Tensor]:
     """Return the hyperparameters. Omit θ_A if its module cannot be saved, since the robot contains it."""
-    left_out = analytical_parameters(hyper) if own is None else {}
+    left_out = analytical_parameters(hyper) if theta is None else {}
     return {k: v for k, v in hyper.items() if k.removeprefix(f"{ANALYTICAL}.") not in left_out}
 
 
@@ -278,9 +280,9 @@ def _check_hyperparameters(spec: Specification, training: Training, hyper: Mappi
         widths = {name: x.shape[-1] for name, x in scale.mean.items()}
         expected = prior.kernel.initial(prior.outputs(spec.system.robot), widths)
         for key, value in expected.items():
-            found = hyper[f"{prior.prefix}.{key}"]
-            if found.shape != value.shape:
-                raise ValueError(f"hyperparameter '{prior.prefix}.{key}' has shape {tuple(found.shape)}")
+            stored = hyper[f"{prior.prefix}.{key}"]
+            if stored.shape != value.shape:
+                raise ValueError(f"hyperparameter '{prior.prefix}.{key}' has shape {tuple(stored.shape)}")
 
 
 @torch.no_grad()

@@ -514,9 +514,9 @@ class StructuredFit(FittedModel):
             without, _ = training_for(self.specification, self.problem, what, learned=(), fewest=0)
             if not without.samples:
                 return self
-            left = _without(self.added, without.digests)
+            remaining = _without(self.added, without.digests)
             rows = self._problem_of(without).rows(self.hyperparameters)
-            return self._with(latent.without(rows.blocks), left)
+            return self._with(latent.without(rows.blocks), remaining)
         factor = float(what)
         if priors is not None:
             names = [prior.name for prior in self.posterior.priors]
@@ -581,9 +581,9 @@ class StructuredFit(FittedModel):
             noise = noise + _carried(z, self.torque_std**2)
         for quantity, rows in parts.items():
             if quantity in self.noise:
-                own = torch.zeros_like(z.o[0])
-                own[rows] = self.noise[quantity] ** 2
-                noise = noise + torch.diag(own)
+                variance = torch.zeros_like(z.o[0])
+                variance[rows] = self.noise[quantity] ** 2
+                noise = noise + torch.diag(variance)
         return noise
 
     @torch.no_grad()
@@ -621,14 +621,14 @@ class StructuredFit(FittedModel):
 def _without(added: tuple[Tensor, ...], removed: Tensor) -> tuple[Tensor, ...]:
     """Return the digests of the samples that remain after some have been removed."""
     values, counts = torch.cat([*added, removed]).unique(return_counts=True)
-    _, own = torch.cat([values, removed]).unique(return_counts=True)
-    left = counts - 2 * (own - 1)
-    if bool((left < 0).any()):
+    _, occurrences = torch.cat([values, removed]).unique(return_counts=True)
+    remaining = counts - 2 * (occurrences - 1)
+    if bool((remaining < 0).any()):
         raise ModelError(
-            f"{int(-left.clamp(max=0).sum())} of {len(removed)} samples to forget were never added",
+            f"{int(-remaining.clamp(max=0).sum())} of {len(removed)} samples to forget were never added",
             expected="samples of this fit with their full weight, not from a streamed log",
         )
-    return (values.repeat_interleave(left),)
+    return (values.repeat_interleave(remaining),)
 
 
 def _carried(z: AffineMap, variance: Tensor) -> Tensor:

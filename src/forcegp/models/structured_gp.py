@@ -223,13 +223,13 @@ class StructuredGP(Model[StructuredFit]):
     def _continued(self, after: StructuredFit) -> Specification:
         """Return this model with the priors of an earlier fit, including automatically selected priors."""
         spec = self.specification
-        own = () if self.specification.automatic else tuple(prior.name for prior in self.force_priors)
+        stated = () if self.specification.automatic else tuple(prior.name for prior in self.force_priors)
         names = tuple(prior.name for prior in after.force_priors)
         contacts = after.system.contact_names
-        if names[: len(own)] != own or contacts != self.system.contact_names:
+        if names[: len(stated)] != stated or contacts != self.system.contact_names:
             raise ModelError(
                 "`after` is a fit of a different model",
-                expected=f"priors {', '.join(own)} and contacts {', '.join(self.system.contact_names)}",
+                expected=f"priors {', '.join(stated)} and contacts {', '.join(self.system.contact_names)}",
                 got=f"priors {', '.join(names)} and contacts {', '.join(contacts)}",
             )
         robots = [system.robot for system in (self.system, after.specified)]

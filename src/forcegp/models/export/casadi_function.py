@@ -30,15 +30,15 @@ def casadi_function(model: ExportedModel, name: str = "forcegp") -> Any:
     model.check()
     mean, nq = LearnedMotion(model, model.parts(), differentiate=False), model.system.robot.nq
     sizes = dict(zip(ARGUMENTS, (nq, nq, nq, len(model.system.contacts)), strict=True))
-    given = {x: ca.SX.sym(x, n) for x, n in sizes.items()}
-    given |= {"sin": ca.sin(given["q"]), "cos": ca.cos(given["q"])}
+    inputs = {x: ca.SX.sym(x, n) for x, n in sizes.items()}
+    inputs |= {"sin": ca.sin(inputs["q"]), "cos": ca.cos(inputs["q"])}
     values = mean.quantities()
-    results = [_vector(ca, mean.graph, given, values[x].flat) for x in DIFFERENTIATED]
+    results = [_vector(ca, mean.graph, inputs, values[x].flat) for x in DIFFERENTIATED]
     names = list(ARGUMENTS), list(DIFFERENTIATED)
-    return ca.Function(name, [given[x] for x in ARGUMENTS], results, *names)
+    return ca.Function(name, [inputs[x] for x in ARGUMENTS], results, *names)
 
 
-def _vector(ca: Any, graph: Graph, given: Mapping[str, Any], outputs: Iterable[Scalar]) -> Any:
+def _vector(ca: Any, graph: Graph, inputs: Mapping[str, Any], outputs: Iterable[Scalar]) -> Any:
     """Return the output scalars as a single CasADi vector."""
     outputs, values = list(outputs), dict[int, Any]()
     functions = {"step": lambda x: x > 0.0} | OPERATORS
@@ -48,7 +48,7 @@ def _vector(ca: Any, graph: Graph, given: Mapping[str, Any], outputs: Iterable[S
         if op == "const":
             values[position] = ca.SX(left)
         elif op == "input":
-            values[position] = given[left][right]  # pyright: ignore[reportArgumentType]
+            values[position] = inputs[left][right]  # pyright: ignore[reportArgumentType]
         else:
             values[position] = functions[op](*(values[x] for x in (left, right) if isinstance(x, int)))
     return ca.vertcat(*(values[x.position] for x in outputs)) if outputs else ca.SX(0, 1)

@@ -192,9 +192,9 @@ def _reference(model: ExportedModel, fit: Predictor, name: str) -> str:
         time, header = torch.arange(len(q), dtype=q.dtype), DataHeader(ordered=False)
         data = Dataset(time, q, qd, tau, qdd, model.system.robot.joint_names, contact=closed, header=header)
         assert isinstance(fit, LearnedForces)
-        found = external_wrench(fit, data, model.wrench, "acceleration")
-        assert found.covariance is not None
-        tables |= {"qdd": qdd, "wrench": found.mean, "wrench_covariance": found.covariance.flatten(1)}
+        wrench = external_wrench(fit, data, model.wrench, "acceleration")
+        assert wrench.covariance is not None
+        tables |= {"qdd": qdd, "wrench": wrench.mean, "wrench_covariance": wrench.covariance.flatten(1)}
     for key, x in {**tables, "closed": flags}.items():
         kind = {"closed": "unsigned char"}.get(key, real if key in ("q", "qd", "tau", "qdd") else "double")
         rows = ",\n  ".join("{" + ", ".join(map(repr, row)) + "}" for row in x.tolist()).replace("nan", "NAN")

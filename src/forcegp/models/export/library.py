@@ -223,7 +223,7 @@ class CompiledFit(Predictor):
         """Return a prediction with descriptions of its undetermined components."""
         names, doubts = self.system.contact_names, dict[str, None]()
         closed = self._learned[-1 - len(names) : -1] if self._learned is not None else torch.zeros(len(names))
-        never = [name for name, own in zip(names, closed, strict=True) if own == 0.0]
+        never = [name for name, count in zip(names, closed, strict=True) if count == 0.0]
         never = [name for name in never if name in self.model.never_closed]
 
         def read(piece: FlatStates) -> tuple[Tensor | None, ...]:
@@ -343,8 +343,8 @@ class CompiledFit(Predictor):
         mean, covariance = q.new_empty(*flat.batch, k), q.new_empty(*flat.batch, k, k)
         beyond = q.new_empty(*flat.batch, nq)
         slopes = q.new_empty((*flat.batch, k, 4, nq) if differentiate else (0, k, 4, nq))
-        given = [x.contiguous() for x in (flat.q, flat.qd, flat.tau, rows, flat.active)]
-        pointers = [None if x is None else x.data_ptr() for x in (*given, std, mean, covariance, beyond)]
+        inputs = [x.contiguous() for x in (flat.q, flat.qd, flat.tau, rows, flat.active)]
+        pointers = [None if x is None else x.data_ptr() for x in (*inputs, std, mean, covariance, beyond)]
         along = slopes.data_ptr() if differentiate else None
         count = flat.batch.numel()
         status = self.library.forcegp_external_wrench(self._memory, count, *pointers, along)
@@ -364,10 +364,10 @@ class CompiledFit(Predictor):
         """Return the mean acceleration and multiplier with their Jacobians (see `StructuredFit`)."""
         if system is not None and system is not self.system:
             raise ModelError("a compiled fit predicts on its own system", hint="use the method of the fit")
-        found = self.jacobian(q, qd, tau, ["qdd", "multiplier"], active=active)
+        prediction = self.jacobian(q, qd, tau, ["qdd", "multiplier"], active=active)
         fields: list[Tensor] = []
-        for at in found.parts.values():
-            fields += [found.mean[..., at], *(x[..., at, :] for x in found[1:4])]
+        for at in prediction.parts.values():
+            fields += [prediction.mean[..., at], *(x[..., at, :] for x in prediction[1:4])]
         return ForceLinearization(*fields)
 
     def _states(
@@ -377,8 +377,8 @@ class CompiledFit(Predictor):
         if active is None and self._plain(q, qd, tau):
             return (q, qd, tau, None), q.shape[:-1]
         flat = flat_states(self.system, q, qd, tau, active)
-        given = *(x.to(self.model.dtype) for x in flat[:3]), flat.active
-        return tuple(x.contiguous() for x in given), flat.batch
+        arrays = *(x.to(self.model.dtype) for x in flat[:3]), flat.active
+        return tuple(x.contiguous() for x in arrays), flat.batch
 
     def _new(self, *shape: int) -> Tensor:
         """Return a new array with the precision of the C code."""

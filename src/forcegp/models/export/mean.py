@@ -326,9 +326,9 @@ class LearnedMotion(Mean):
 
     def tangents(self, outputs: Iterable[Scalar]) -> Scalars:
         """Return the derivatives of scalars, with shape `(outputs, 3 nq)`."""
-        found, zero = self.graph.tangents(list(outputs), self.seeds), self.graph.constant(0.0)
+        tangents, zero = self.graph.tangents(list(outputs), self.seeds), self.graph.constant(0.0)
         directions = range(3 * self.robot.nq)
-        return np.array([[t.get(d, zero) for d in directions] for t in found], dtype=object)
+        return np.array([[t.get(d, zero) for d in directions] for t in tangents], dtype=object)
 
     def quantities(self) -> dict[str, Scalars]:
         """Return the posterior mean of each quantity in `DIFFERENTIATED`."""
