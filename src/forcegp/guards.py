@@ -58,8 +58,8 @@ class Unpacking:
 
     def unpack(self, packed: bytes, compression: str) -> bytes:
         """Unpack part of the log, up to the allowed size."""
-        left = allowed_bytes(self.file, limits.FREE_BAG_BYTES) - self.size
-        content = _opened(packed, compression).read(left + 1)
+        remaining = allowed_bytes(self.file, limits.FREE_BAG_BYTES) - self.size
+        content = _opened(packed, compression).read(remaining + 1)
         self.read(len(content))
         return content
 

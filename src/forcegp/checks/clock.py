@@ -189,8 +189,8 @@ def check_clock_unit(system: ConstrainedSystem, log: Log) -> Outcome:
         return [], log
     factor = float(np.median(first.low[first.moving]))
     if log.derived or "qdd" in log.header.derived:
-        found = _unit(factor) is not None or _one_factor(first, factor)
-        return _clock_finding(log, factor) if found else ([], log)
+        is_common = _unit(factor) is not None or _one_factor(first, factor)
+        return _clock_finding(log, factor) if is_common else ([], log)
     second = match(log, "qd", "qdd")
     if second is None or not (both := first.moving & second.moving).any():
         return [], log
@@ -206,8 +206,8 @@ def _implausible_period(log: Log) -> Outcome:
         return [], log
     unit = min(UNITS, key=lambda unit: abs(np.log(unit * log.dt / TYPICAL)))
     text = f"rows are {log.dt:.4g} apart, which in seconds is an implausible sampling period of a robot's log"
-    found = [log.finding("time-unit", text, seconds_per_unit=unit, period=log.dt)]
-    return found, recomputed(log.replace(t=unit * log.t))
+    findings = [log.finding("time-unit", text, seconds_per_unit=unit, period=log.dt)]
+    return findings, recomputed(log.replace(t=unit * log.t))
 
 
 def _unit(factor: float) -> float | None:
@@ -227,14 +227,14 @@ def _clock_finding(log: Log, factor: float) -> Outcome:
         text = f"positions and velocities change {factor:.4g} times as far as the clock allows"
         if (kept := round(factor)) > 1 and abs(factor - kept) <= NEAR_WHOLE * kept:
             text += f"; or the log has only one of {kept} rows, evenly, with the stamps of all of them"
-    found = log.finding(kind, text, seconds_per_unit=factor, period=log.dt)
+    finding = log.finding(kind, text, seconds_per_unit=factor, period=log.dt)
     log = log.replace(t=log.t * scale)
     second = match(log, "qd", "qdd")
     if "qdd" in log.derived | {*log.header.derived} and second is not None and second.moving.any():
         slope = max(float(np.median(second.low[second.moving])), 1e-300)
         if abs(np.log(slope * scale)) < abs(np.log(slope)):  # derived by the wrong clock
             log = log.replace(qdd=log.qdd / scale)
-    return [found], log
+    return [finding], log
 
 
 def _one_factor(level: Match, factor: float) -> bool:

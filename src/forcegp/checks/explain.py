@@ -164,8 +164,8 @@ def _accepted(model: Explanation, hypothesis: Hypothesis, theta: Array, finding:
     taken = model.taken | {(hypothesis.name, hypothesis.joints)}
     model = replace(model, findings=(*model.findings, finding), taken=taken)
     if hypothesis.name in (*hypotheses.ROBOT, hypotheses.CHANGE):
-        own = hypothesis.name, hypothesis.first
-        return replace(model.beside(hypothesis), robot=(own, *model.robot)).weighed()
+        group = hypothesis.name, hypothesis.first
+        return replace(model.beside(hypothesis), robot=(group, *model.robot)).weighed()
     repair = partial(corrected, hypothesis=hypothesis, theta=theta)
     log = repair(model.log)
     problem = hypotheses.problem_of(model.system, log, model.rows)
@@ -249,8 +249,8 @@ def _while_moving(model: Explanation, hypothesis: Hypothesis) -> bool:
     if hypothesis.columns is None:
         better = at(hypothesis.change(log)).fit
     else:
-        given = hypothesis.columns, hypothesis.instruments
-        columns, instruments = (None if x is None else x * moving[..., None] for x in given)
+        pair = hypothesis.columns, hypothesis.instruments
+        columns, instruments = (None if x is None else x * moving[..., None] for x in pair)
         better = null.with_(replace(hypothesis, columns=columns, instruments=instruments))
     return significant(better.shares, null.fit.shares, len(hypothesis.joints) or log.nq)
 

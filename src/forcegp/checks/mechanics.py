@@ -265,10 +265,10 @@ def _offsets(explanation: Explanation) -> list[Finding]:
     if (weightless := _weightless(explanation, list(off))) is not None:
         rivals = [weightless, *(f for f in rivals if f.kind != weightless.kind)]
     # One cause that takes the place of the offsets of several joints is named before them.
-    found = [log.finding("torque-offset", text, names, **evidence), *rivals]
+    findings = [log.finding("torque-offset", text, names, **evidence), *rivals]
     single = [f for f in rivals if f.kind == "torque-without-gravity" or "factor" in f.evidence]
-    first = (single or found)[0]
-    return [with_alternatives(first, [f for f in found if f is not first])]
+    first = (single or findings)[0]
+    return [with_alternatives(first, [f for f in findings if f is not first])]
 
 
 def _weightless(explanation: Explanation, off: list[int]) -> Finding | None:
@@ -366,7 +366,7 @@ def residual_trace(explanation: Explanation, rows: np.ndarray) -> Array:
     parts, coefficients = [], robust_parameters(explanation.problem, explanation.columns, explanation.prior)
     for index in np.array_split(rows, max(1, len(rows) // 2048)):
         part = explanation.on(log, index)
-        columns = [hypotheses.robot_columns(system, log, index, *own)[0] for own in explanation.robot]
+        columns = [hypotheses.robot_columns(system, log, index, *group)[0] for group in explanation.robot]
         r = part.r - np.concatenate([*columns, part.nuisance], axis=-1) @ coefficients
         parts.append(part.without_contact(r[..., None])[..., 0] * part.scale)
     return np.concatenate(parts)

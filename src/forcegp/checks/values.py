@@ -150,10 +150,10 @@ def _shocks(log: Log, departures: dict[str, tuple[Array, Array, Array]], name: s
     pair = ("tau", "qdd") if name in ("tau", "qdd") else (name,)
     size = {key: _size(log, key, *departures[key]) for key in pair if key in departures}
     confirmed = np.zeros(departure.shape, bool)
-    for j, own in enumerate(size[name].T):
+    for j, size_j in enumerate(size[name].T):
         others = [np.delete(part, j, axis=1) if key == name else part for key, part in size.items()]
         most = np.concatenate(others, axis=1).max(axis=1, initial=0.0)
-        confirmed[:, j] = most > own * np.where(own < 1.0, SPIKE_SHARED, DRIVEN)
+        confirmed[:, j] = most > size_j * np.where(size_j < 1.0, SPIKE_SHARED, DRIVEN)
     return confirmed
 
 

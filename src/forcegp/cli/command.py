@@ -61,12 +61,12 @@ def keeping_inputs(function: Callable[..., R]) -> Callable[..., R]:
 
 def paths_of(function: Callable[..., Any]) -> dict[str, bool]:
     """Return whether each option of a command that accepts a path names a result, by its name."""
-    found = {}
+    results = {}
     for name, hint in get_type_hints(function, include_extras=True).items():
         info = next((x for x in getattr(hint, "__metadata__", ()) if isinstance(x, ParameterInfo)), None)
         if info is not None and (name in BUNDLED or Path in _types(hint)):
-            found[name] = info.writable
-    return found
+            results[name] = info.writable
+    return results
 
 
 def _types(hint: Any) -> Iterator[Any]:
@@ -136,9 +136,9 @@ def _named(path: Path, roots: list[Path]) -> list[Path]:
     roots += [folder, *(folder / x for e in elements for name in MESH_FOLDERS if (x := e.get(name)))]
     names = [x for e in elements for name in ("file", "filename") if (x := e.get(name))]
     packages = [folder, *folder.resolve().parents]
-    found = [name.rpartition("://")[2] for name in names if "://" in name]
-    places = [root / name for name in found for root in packages]
-    places += [folder / name.partition("/")[2] for name in found]
+    in_packages = [name.rpartition("://")[2] for name in names if "://" in name]
+    places = [root / name for name in in_packages for root in packages]
+    places += [folder / name.partition("/")[2] for name in in_packages]
     places += [root / name for name in names for root in roots]
     return list(filter(Path.is_file, places))
 

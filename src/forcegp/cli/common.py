@@ -198,13 +198,13 @@ def words(text: str | None) -> tuple[str, ...]:
 def numbers(option: str, text: str | None, count: int | None = None) -> tuple[float, ...]:
     """Return the numbers in a comma-separated list; raise `ParameterError` unless there are `count`."""
     try:
-        found = tuple(map(float, words(text)))
+        values = tuple(map(float, words(text)))
     except ValueError:
-        found = (math.nan,)
-    if any(map(math.isnan, found)) or count not in (None, len(found)):
+        values = (math.nan,)
+    if any(map(math.isnan, values)) or count not in (None, len(values)):
         expected = "comma-separated numbers" if count is None else f"{count} comma-separated numbers"
         raise ParameterError(f"--{option} is not a list of numbers", expected=expected, got=text)
-    return found
+    return values
 
 
 def check_robot_named(scene: str | None, robot: str | None) -> None:

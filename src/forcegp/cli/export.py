@@ -122,7 +122,7 @@ def _written_back(
     if is_mjcf(robot) != (to == "mjcf"):
         text = f"{robot} has a different format"
         raise RobotFileError(text, expected=to, got="mjcf" if to == "urdf" else "urdf")
-    found = write_calibrated(fit, robot, out, samples=samples, seed=seed, gain_std=gain_std)
-    determined = sum(parameter.determined for parameter in found.parameters)
+    calibration = write_calibrated(fit, robot, out, samples=samples, seed=seed, gain_std=gain_std)
+    determined = sum(parameter.determined for parameter in calibration.parameters)
     result: dict[str, object] = {"file": str(out), "report": str(out.with_name(f"{out.stem}.report.json"))}
-    return result | {"parameters": len(found.parameters), "determined": determined, "samples": samples}
+    return result | {"parameters": len(calibration.parameters), "determined": determined, "samples": samples}

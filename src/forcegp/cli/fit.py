@@ -94,11 +94,11 @@ def fit(
     for doubt in (*doubts, *learned.result.warnings):
         common.warn(doubt)
     if as_json:
-        found = {"model": regression.name, "training_points": len(training), **_complete(learned)}
+        summary = {"model": regression.name, "training_points": len(training), **_complete(learned)}
     else:
-        found = _summary(learned, regression.name, len(training))
-        found |= _details(learned.result) if verbose else {}
-    show({**found, "file": str(model_path(out))}, as_json)
+        summary = _summary(learned, regression.name, len(training))
+        summary |= _details(learned.result) if verbose else {}
+    show({**summary, "file": str(model_path(out))}, as_json)
 
 
 CLEAR = 2.0
@@ -116,11 +116,11 @@ def _complete(learned: FittedModel) -> dict[str, object]:
     """Return the complete result of a fit, for programs."""
     from forcegp.models.structured_fit import StructuredFit
 
-    found = _numbers(learned.result)
+    result = _numbers(learned.result)
     if isinstance(learned, StructuredFit):
-        found["torque_noise"] = None if learned.torque_std is None else learned.torque_std.tolist()
-        found["robot_parameters"] = [vars(each) for each in learned.robot_parameters()]
-    return found
+        result["torque_noise"] = None if learned.torque_std is None else learned.torque_std.tolist()
+        result["robot_parameters"] = [vars(each) for each in learned.robot_parameters()]
+    return result
 
 
 def _numbers(result: FitResult) -> dict[str, object]:
@@ -148,7 +148,7 @@ def _summary(learned: FittedModel, name: str, rows: int) -> dict[str, object]:
         others = [p for p in parameters if not p.name.startswith((*GROUPS, *FRICTION))]
         for contact in learned.system.contact_names:
             groups[f"contact {contact}"] = [p for p in others if p.of == contact]
-        lines |= {group: _listed(own) for group, own in groups.items() if own}
+        lines |= {group: _listed(listed) for group, listed in groups.items() if listed}
         if not parameters:
             lines["forces"] = ", ".join(prior.name for prior in learned.force_priors)
         kinds = learned.system.robot.joint_types
@@ -162,15 +162,15 @@ def _show_joints(learned: StructuredFit, parameters: Sequence[RobotParameter]) -
     """Print a table of the friction and the torque noise of each joint."""
     import torch
 
-    found = {(p.of, p.name): p for p in parameters if p.name in FRICTION}
-    if not found:
+    friction = {(p.of, p.name): p for p in parameters if p.name in FRICTION}
+    if not friction:
         return
     robot, noise, rows = learned.system.robot, learned.torque_std, [["joint", *FRICTION, "torque noise"]]
     tau = torch.cat([m.tau for m in learned.training.measurements])
     for j, joint in enumerate(robot.joint_names):
         if not bool(robot.driven[j]):
             continue
-        each = (found.get((joint, name)) for name in FRICTION)
+        each = (friction.get((joint, name)) for name in FRICTION)
         cells = [f"{rounded(p.value, p.std)} at {p.speed:.2g}" if p and p.determined else NOT for p in each]
         size = "" if noise is None else f"{float(noise[j]):.2g}"
         share = f" ({float(noise[j] / tau[:, j].std()):.0%})" if noise is not None and tau[:, j].any() else ""
@@ -195,8 +195,8 @@ def _listed(parameters: Sequence[RobotParameter]) -> str:
     missing = [label(p) for p in parameters if not p.determined and not links]
     if len(missing) == len(parameters):
         return "not determined"
-    found = ", ".join(texts) or f"no{' change' if links else 'ne'} beyond {CLEAR:g}σ"
-    return f"{found}; not determined: {', '.join(missing)}" if missing else found
+    text = ", ".join(texts) or f"no{' change' if links else 'ne'} beyond {CLEAR:g}σ"
+    return f"{text}; not determined: {', '.join(missing)}" if missing else text
 
 
 def _training(

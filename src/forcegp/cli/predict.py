@@ -160,14 +160,14 @@ def _with_wrench(
     wrench = model.external_wrench(test, frame, method=method, **at)
     assert wrench.std is not None
     places = [AXES.index(axis) for axis in at["axes"]]
-    found, columns = wrench.detect(), {}
+    detected, columns = wrench.detect(), {}
     for ending, values in (("", wrench.mean), ("_std", wrench.std)):
         whole = values.new_zeros(len(values), len(AXES)).index_copy(1, torch.tensor(places), values)
-        for part, own in zip(("force", "moment"), whole.split(3, dim=1), strict=True):
-            columns[f"predicted_external_{part}{ending}"] = {frame: own}
-    contact = {**test.contact, frame: test.contact.get(frame, found)}
+        for part, component in zip(("force", "moment"), whole.split(3, dim=1), strict=True):
+            columns[f"predicted_external_{part}{ending}"] = {frame: component}
+    contact = {**test.contact, frame: test.contact.get(frame, detected)}
     test = test.replace(contact=contact, contact_extras={**test.contact_extras, **columns})
-    return test, {"frame": frame, "detected": float(found.double().mean())}
+    return test, {"frame": frame, "detected": float(detected.double().mean())}
 
 
 def _with_columns(

@@ -66,25 +66,25 @@ class Graph:
         A seed need not be an input. For example, the solution of an equation can be seeded with its
         derivative. A scalar without directions is treated as a constant.
         """
-        found = dict(seeds)
+        tangents = dict(seeds)
         for position in self.live(outputs, seeds):
             if position not in seeds:
-                found[position] = self._tangents(position, found)
-        return [found[x.position] for x in outputs]
+                tangents[position] = self._tangents(position, tangents)
+        return [tangents[x.position] for x in outputs]
 
-    def _tangents(self, position: int, found: dict[int, Tangents]) -> Tangents:
+    def _tangents(self, position: int, tangents: dict[int, Tangents]) -> Tangents:
         """Return the derivatives of one node, given those of its operands."""
         op, i, j = self.nodes[position]
         if op in ("const", "input", "step"):
             return {}
-        value, a, by_a = Scalar(self, position), Scalar(self, i), found[i]  # pyright: ignore
+        value, a, by_a = Scalar(self, position), Scalar(self, i), tangents[i]  # pyright: ignore
         if j is None:
             factors = {"neg": lambda: self.constant(-1.0), "exp": lambda: value}
             factors |= {"tanh": lambda: 1.0 - value * value, "sqrt": lambda: 0.5 / value}
             factors |= {"sin": lambda: a.cos(), "cos": lambda: -a.sin(), "log": lambda: 1.0 / a}
             factor = factors[op]()
             return {d: t * factor for d, t in by_a.items()}
-        b, by_b = Scalar(self, j), found[j]  # pyright: ignore
+        b, by_b = Scalar(self, j), tangents[j]  # pyright: ignore
         one, by_left, by_right = self.constant(1.0), b, a
         if op in "+-":
             by_left, by_right = one, one if op == "+" else -one

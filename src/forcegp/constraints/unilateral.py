@@ -84,7 +84,7 @@ def normal_rows(system: ConstrainedSystem, rows: Tensor) -> Tensor:
     """Select the first (normal) row of each contact, `(*batch, n_contacts)`, from all rows `(*batch, m)`."""
     if system.m == len(system.contacts):
         return rows
-    return rows[..., [own.start for own in system.rows.values()]]
+    return rows[..., [contact_rows.start for contact_rows in system.rows.values()]]
 
 
 def pulling(system: ConstrainedSystem, active: Tensor, multiplier: Tensor) -> Tensor:

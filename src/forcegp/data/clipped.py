@@ -30,15 +30,15 @@ def clipped(tau: Array, qd: Array, usable: NDArray[np.bool_]) -> NDArray[np.bool
         tau, qd: torques and velocities in time order, `(n, nq)`.
         usable: mask of the rows to check, `(n,)`.
     """
-    found = np.zeros(tau.shape, bool)
+    mask = np.zeros(tau.shape, bool)
     for j in range(tau.shape[1]):
         x = tau[:, j]
         if not usable.any() or np.ptp(x[usable]) == 0.0:
             continue
         for extreme in limits_of(x[usable]):
             for first, last in _plateaus(x, np.abs(qd[:, j]), usable, extreme):
-                found[first:last, j] = True
-    return found
+                mask[first:last, j] = True
+    return mask
 
 
 def limits_of(values: Array) -> tuple[float, float]:

@@ -266,8 +266,8 @@ class Dataset(Fields):
             segments.append(numbers + start)
             start += int(numbers.max()) + 1 if len(part) else 0
         header = fields.common_header([part.header for part in parts])
-        own = {"joint_names": parts[0].joint_names, "segment": torch.cat(segments), "header": header}
-        return Dataset(**mapped(parts, torch.cat) | own)
+        shared = {"joint_names": parts[0].joint_names, "segment": torch.cat(segments), "header": header}
+        return Dataset(**mapped(parts, torch.cat) | shared)
 
     @classmethod
     def read(

@@ -442,16 +442,16 @@ def common_header(headers: Sequence[DataHeader]) -> DataHeader:
 
 def common_recordings(headers: Sequence[DataHeader]) -> dict[str, str]:
     """Return the recordings of all headers; raise `DataError` if two logs have the same name."""
-    found: dict[str, str] = {}
+    recordings: dict[str, str] = {}
     for name, log in (pair for header in headers for pair in header.recordings.items()):
-        if log and found.get(name):
-            if log != found[name]:
+        if log and recordings.get(name):
+            if log != recordings[name]:
                 raise DataError(
                     f"two recordings are named {name!r}",
                     expected="a distinct name for each log, since a recording has its own offset",
-                    got=", ".join(found),
+                    got=", ".join(recordings),
                     hint="rename one: data.named('another name'), or `forcegp import --recording`",
                 )
         else:
-            found[name] = log or found.get(name, "")
-    return found
+            recordings[name] = log or recordings.get(name, "")
+    return recordings

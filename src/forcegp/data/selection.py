@@ -238,15 +238,15 @@ def outliers(*columns: Tensor) -> Tensor:
         columns: values `(n, d)` each.
     """
     values = torch.cat(columns, dim=-1)
-    found = torch.zeros(len(values), dtype=torch.bool, device=values.device)
-    while int((~found).sum()) > 1:
-        size = values[~found].abs()
+    mask = torch.zeros(len(values), dtype=torch.bool, device=values.device)
+    while int((~mask).sum()) > 1:
+        size = values[~mask].abs()
         k = min(math.ceil(COMMON * len(size)), len(size) - 1)
         new = (size > (APART * size.kthvalue(k, dim=0).values).clamp(min=POSSIBLE)).any(-1)
         if not bool(new.any()):
             break
-        found[~found] = new
-    return found
+        mask[~mask] = new
+    return mask
 
 
 IMPACT = "impact"

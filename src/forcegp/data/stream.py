@@ -83,10 +83,10 @@ def _columns(file: Path, table: pa.Table) -> Columns:
 
 def _with_context(before: Columns, columns: Columns, after: Columns) -> tuple[Columns, int]:
     """Return a piece with context rows of its first and last trajectory, and the number of rows before it."""
-    own = columns["segment"]
+    segment = columns["segment"]
     parts = [
         {name: values[part["segment"] == number] for name, values in part.items()}
-        for part, number in ((before, own[0]), (after, own[-1]))
+        for part, number in ((before, segment[0]), (after, segment[-1]))
     ]
     parts.insert(1, columns)
     whole = {name: np.concatenate([part[name] for part in parts if part]) for name in columns}

@@ -146,10 +146,10 @@ class Evaluation:
     @property
     def doubts(self) -> tuple[str, ...]:
         """Reasons why the scores may be misleading."""
-        found = []
+        sentences = []
         if self.gravity is not None and self.gravity > GRAVITY_ALONE:
             share = f"{100.0 * self.gravity:.1f} %"
-            found.append(
+            sentences.append(
                 f"Gravity alone explains {share} of the torque, so the data hardly test anything else."
             )
         if far := self._beyond_mean(FAR):
@@ -157,28 +157,28 @@ class Evaluation:
             text = ", ".join(
                 f"{joint} {model:.3g} (mean: {mean:.3g})" for joint, (model, mean) in far.items()
             )
-            found.append(f"Acceleration errors are far larger than those of the mean [{units}]: {text}.")
+            sentences.append(f"Acceleration errors are far larger than those of the mean [{units}]: {text}.")
         if weak := self._responding(self.own_response, LEAST_RESPONSE, math.inf):
             text = f"An added torque has too small an effect (expected: 1): {_values(weak)}."
-            found.append(f"{text} The model has learned the controller, not the arm.")
+            sentences.append(f"{text} The model has learned the controller, not the arm.")
         if self.payload is not None:
             mass, std = self.payload.mass, self.payload.std
             size = f"{abs(mass):.3g} ± {2.0 * std:.1g} kg {'more' if mass > 0.0 else 'less'}"
-            found.append(
+            sentences.append(
                 f"Free motion fits with {size} on the last link than the model has: the payload changed, "
                 "or the model has wrong masses. Contact forces include this weight."
             )
         if self.left_out:
             rows = describe(numbered(np.array(self.left_out))).capitalize()
-            found.append(f"{rows}: left out, since a value is impossible.")
+            sentences.append(f"{rows}: left out, since a value is impossible.")
         changed = self._responding(self.response, LEAST_RESPONSE, 1.0 / LEAST_RESPONSE)
         doubtful = changed.keys() & self._beyond_mean(SUPPORTED).keys() - weak.keys()
         if other := {joint: x for joint, x in changed.items() if joint in doubtful}:
             text = (
                 f"An added torque has another effect than in the robot file (expected: 1): {_values(other)}."
             )
-            found.append(f"{text} The logged accelerations of these joints do not support the inertia.")
-        return tuple(found)
+            sentences.append(f"{text} The logged accelerations of these joints do not support the inertia.")
+        return tuple(sentences)
 
     def _beyond_mean(self, factor: float) -> dict[str, tuple[float, float]]:
         """Return the errors of the model and of the mean in q̈, for joints with a ratio above `factor`."""

@@ -96,8 +96,8 @@ def beyond_gravity(system: ConstrainedSystem, data: Dataset) -> tuple[Tensor, fl
 
 def explained(error: Tensor, rest: Tensor) -> tuple[float | None, ...]:
     """Return R² of each joint from errors and non-gravitational torques `(n, nq)`, or `None` if `FAINT`."""
-    left, whole = (error**2).sum(0), (rest**2).sum(0)
-    shares, seen = (1.0 - left / whole).tolist(), (whole > FAINT**2 * whole.max()).tolist()
+    residual, whole = (error**2).sum(0), (rest**2).sum(0)
+    shares, seen = (1.0 - residual / whole).tolist(), (whole > FAINT**2 * whole.max()).tolist()
     return tuple(share if clear else None for share, clear in zip(shares, seen, strict=True))
 
 
@@ -142,9 +142,9 @@ def payload_change(model: FittedModel, error: Tensor, data: Dataset) -> PayloadC
     problem = replace(problem_of(system, log, rows), r=r)
     columns, prior = robot_columns(system, log, rows, "payload")
     null, fit = cross_validate(problem), cross_validate(problem, columns, prior)
-    found = PayloadChange(float(fit.theta[0]), float(fit.spread[0]))
-    clear = abs(found.mass) > SIGNIFICANT * found.std
-    return found if clear and significant(fit.shares, null.shares, data.nq) else None
+    change = PayloadChange(float(fit.theta[0]), float(fit.spread[0]))
+    clear = abs(change.mass) > SIGNIFICANT * change.std
+    return change if clear and significant(fit.shares, null.shares, data.nq) else None
 
 
 @torch.no_grad()
@@ -166,23 +166,23 @@ def open_loop(model: FittedModel, system: ConstrainedSystem, data: Dataset) -> M
             starts = first[torch.linspace(0, len(first) - 1, min(STARTS, len(first))).round().long().unique()]
             models = {"model": model, "robot file": AnalyticalModel(system).nominal()}
             options = RolloutOptions(on_divergence="keep")
-            found = compare(models, data, steps * dt, starts, system=system, options=options)
-            shares = (_shares(found, name, HORIZONS[:count]) for name in models)
+            comparison = compare(models, data, steps * dt, starts, system=system, options=options)
+            shares = (_shares(comparison, name, HORIZONS[:count]) for name in models)
             return Motion(HORIZONS[:count], len(starts), *shares)
     return None
 
 
-def _shares(found: Comparison, name: str, horizons: tuple[float, ...]) -> tuple[float | None, ...]:
+def _shares(comparison: Comparison, name: str, horizons: tuple[float, ...]) -> tuple[float | None, ...]:
     """Return the error relative to the change in the joint positions at each horizon."""
     shares: list[float | None] = []
     for horizon in horizons:
-        step = int((found.t - horizon).abs().argmin())
-        q = found.predicted[name].q
-        moved = (found.q[:, step] - found.q[:, 0]).square().mean(0).sqrt()
+        step = int((comparison.t - horizon).abs().argmin())
+        q = comparison.predicted[name].q
+        moved = (comparison.q[:, step] - comparison.q[:, 0]).square().mean(0).sqrt()
         if q.shape[1] <= step or not bool(moved.max() > 0.0):
             shares.append(None)
             continue
-        error = (q[:, step] - found.q[:, step]).square().mean(0).sqrt()
+        error = (q[:, step] - comparison.q[:, step]).square().mean(0).sqrt()
         share = float((error / moved)[moved > FAINT * moved.max()].median())
         shares.append(share if math.isfinite(share) else None)
     return tuple(shares)

@@ -143,10 +143,10 @@ def logged_forces(model: Predictor, data: Dataset) -> dict[str, Tensor]:
     never = model.result.never_closed if isinstance(model, StructuredFit) else ()
     names = [name for name in model.system.contact_names if name not in never]
     logged = data.contact_extras.get("multiplier", {})
-    found = {name: logged[name] for name in names if name in logged}
-    if not found and len(names) == 1 and has_sensor(data, model.system):
+    forces = {name: logged[name] for name in names if name in logged}
+    if not forces and len(names) == 1 and has_sensor(data, model.system):
         return {names[0]: sensed_force(data, model.system)}
-    return found
+    return forces
 
 
 @torch.no_grad()

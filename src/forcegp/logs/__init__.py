@@ -239,7 +239,7 @@ def _dataset(
         robot_fingerprint=robot.fingerprint,
         provenance=tuple(report.steps),
         derived=derived,
-        imported=tuple((found.kind, found.message) for found in report.findings),
+        imported=tuple((finding.kind, finding.message) for finding in report.findings),
         unmeasured_torques=mapping.torque.unmeasured,
         stick_speeds=sticking,
         torque_scale_std=scale_std(mapping),

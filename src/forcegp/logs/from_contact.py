@@ -111,8 +111,8 @@ def _solve(
         if "qdd" in vectors:
             solved["qdd"] = qdd = vectors["qdd"].clone()
             qdd[:, u] = 0.0
-            left = system.equations(q, qd).b[..., None] - A @ qdd[..., None]
-            qdd[:, u] = torch.linalg.lstsq(A[..., u], left).solution[..., 0]
+            residual = system.equations(q, qd).b[..., None] - A @ qdd[..., None]
+            qdd[:, u] = torch.linalg.lstsq(A[..., u], residual).solution[..., 0]
     return solved
 
 
@@ -133,15 +133,15 @@ def stick_speeds(
         speed = eom.contact_points[contact.name].sliding[1].norm(dim=-1).numpy()
         flag = signals.vectors.get(f"{STICKS}{contact.name}")
         if section.stick_speed != "auto":
-            found = section.stick_speed
+            limit = section.stick_speed
         elif flag is not None:
-            found = dividing_speed(speed, flag[closed, 0] >= 0.5)
+            limit = dividing_speed(speed, flag[closed, 0] >= 0.5)
         else:
-            found = resting_speed(speed)
-        if found is not None:
-            speeds[contact.name] = found
-            share, other = 100.0 * (speed < found).mean(), f'"never" under [contact.{contact.name}]'
-            text = f"contact {contact.name!r} sticks below {1e3 * found:.3g} mm/s, {share:.0f} % of its rows"
+            limit = resting_speed(speed)
+        if limit is not None:
+            speeds[contact.name] = limit
+            share, other = 100.0 * (speed < limit).mean(), f'"never" under [contact.{contact.name}]'
+            text = f"contact {contact.name!r} sticks below {1e3 * limit:.3g} mm/s, {share:.0f} % of its rows"
             report.find("sticks", f"{text}; stick_speed = {other} if it slides")
     return speeds
 

@@ -147,9 +147,9 @@ class _Gathering:
         scale, offset = self._scale(name), self.mapping.per_joint(name, "offset", joints)
         result = np.zeros((len(stream), len(self.joints)))
         for i, (joint, column) in enumerate(zip(joints, columns, strict=True)):
-            own = result[:, self.joints.index(joint)]
-            np.subtract(self._take(stream, column), offset[i], out=own)
-            own *= scale[self.joints.index(joint)]
+            values = result[:, self.joints.index(joint)]
+            np.subtract(self._take(stream, column), offset[i], out=values)
+            values *= scale[self.joints.index(joint)]
             if isinstance(stream.columns, dict) and len(stream.columns) > 1:
                 del stream.columns[column]  # hold only one copy in memory
         return stream, self._of_joints(name, result) if section.side == "motor" else result

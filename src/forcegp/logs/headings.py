@@ -88,8 +88,8 @@ def declared_unit(name: str, stream: Stream) -> str | None:
     """Return the unit declared in a heading or in the line below it, or `None`."""
     if name in stream.units:
         return units.spelled(stream.units[name])
-    found = (units.spelled(match[match.lastindex or 0]) for match in _DECLARED.finditer(name))
-    return next((unit for unit in found if unit is not None), None)
+    declared = (units.spelled(match[match.lastindex or 0]) for match in _DECLARED.finditer(name))
+    return next((unit for unit in declared if unit is not None), None)
 
 
 def find_time(table: LogTable, draft: Draft) -> Stream:
@@ -102,7 +102,7 @@ def find_time(table: LogTable, draft: Draft) -> Stream:
         got = ", ".join(sorted(rows, key=lambda name: not _TIME.match(name)))[:300] + table.left_out
         hint = "times as numbers, as 2025-11-27 14:03:22.008 or as 27.11.2025 14:03:22,008 are read"
         raise MappingError(text, expected="a column of time stamps with as many rows", got=got, hint=hint)
-    _, column, unit, step = max(candidates, key=lambda found: found[0])
+    _, column, unit, step = max(candidates, key=lambda candidate: candidate[0])
     if unit is not None:
         shown = " and ".join([unit] if isinstance(unit, str) else unit)
         seconds = step * units.TIME[unit] if isinstance(unit, str) else step
@@ -117,8 +117,8 @@ def find_time(table: LogTable, draft: Draft) -> Stream:
     for other in (s for s in table.streams if s is not stream and len(s) != len(stream)):
         stamps = [name for name in other.columns if _TIME.match(re.sub(r"\[\d+\]$", "", name.lower()))]
         if stamps and len(stamps) == len(other.columns):
-            told = f"{', '.join(stamps)} was left out: {len(other)} rows, where the joints have {len(stream)}"
-            draft.say("time", told, doubt=True)
+            text = f"{', '.join(stamps)} was left out: {len(other)} rows, where the joints have {len(stream)}"
+            draft.say("time", text, doubt=True)
     segment = next((name for name in _SEGMENTS if name in stream.columns), None)
     draft.time = {"column": column, "unit": unit, "segment": segment}
     return stream
@@ -146,8 +146,8 @@ def _evenness(values: np.ndarray) -> tuple[float, float] | None:
 def _clocks(stream: Stream) -> Iterator[Clock]:
     """Yield the columns that increase like time."""
     for name, values in stream.columns.items():
-        if (found := _evenness(values)) is not None:
-            step, even = found
+        if (evenness := _evenness(values)) is not None:
+            step, even = evenness
             score = 2.0 * (bool(_TIME.match(name.lower())) or name == "header") + even + (name == "header")
             unit = declared_unit(name, stream)
             yield score, name, unit if unit in units.TIME else None, step
@@ -168,8 +168,8 @@ def _split_clocks(stream: Stream) -> Iterator[Clock]:
             named = _TIME.match(fine.lower()) if date else unit in SPLIT and _same_clock(coarse, fine)
             if not named or not ((seconds >= 0.0) & (seconds < (DAY if date else 1.0))).all():
                 continue
-            if (found := _evenness(whole - whole[0] + seconds)) is not None:
-                yield 3.5 + found[1], [coarse, fine], ["s", unit], found[0]
+            if (evenness := _evenness(whole - whole[0] + seconds)) is not None:
+                yield 3.5 + evenness[1], [coarse, fine], ["s", unit], evenness[0]
 
 
 def _unit_of_time(name: str, stream: Stream) -> str | None:
@@ -194,8 +194,8 @@ def doubtful(name: str) -> str | None:
     """Return why a name is not that of a measurement, or `None`."""
     words = tokens(name)
     kinds = (("a command", COMMANDED), ("the output of a model", MODELLED))
-    found = ((kind, word) for kind, listed in kinds for word in words if word in listed)
-    return next((f"{kind} ({word!r})" for kind, word in found), None)
+    matches = ((kind, word) for kind, listed in kinds for word in words if word in listed)
+    return next((f"{kind} ({word!r})" for kind, word in matches), None)
 
 
 def find_families(stream: Stream, joints: tuple[str, ...], draft: Draft) -> None:
@@ -255,10 +255,10 @@ def _families(stream: Stream, joints: tuple[str, ...], partly: bool = False) -> 
     names = "|".join(re.escape(name) for name in sorted(joints, key=len, reverse=True))
     for column in stream.columns:
         joint = re.search(names, column) or re.search(names, column, re.I)
-        for found in [*([joint] if joint else []), *re.finditer(r"\d+", column)]:
-            pattern = f"{column[: found.start()]}{{joint}}{column[found.end() :]}"
-            groups.setdefault(pattern, {})[found[0]] = column
-            if found is joint and _quantity(pattern) is not None:
+        for match in [*([joint] if joint else []), *re.finditer(r"\d+", column)]:
+            pattern = f"{column[: match.start()]}{{joint}}{column[match.end() :]}"
+            groups.setdefault(pattern, {})[match[0]] = column
+            if match is joint and _quantity(pattern) is not None:
                 break
     complete = (
         (p, of) for p, of in groups.items() if len(of) == len(joints) or (partly and len(of) < len(joints))
@@ -377,12 +377,12 @@ _ROLES: tuple[tuple[str, int, set[str], set[str]], ...] = (
 
 def find_base(table: LogTable, robot: RobotModel, draft: Draft) -> LogTable:
     """Propose `[base]` for the columns of a free base and of an IMU, and return the log without them."""
-    found = [(stream, _vectors(stream)) for stream in table.streams]
-    of_base = next(((s, of) for s, of in found if {"position", "quaternion"} <= set(of)), None)
+    pairs = [(stream, _vectors(stream)) for stream in table.streams]
+    of_base = next(((s, of) for s, of in pairs if {"position", "quaternion"} <= set(of)), None)
     if BASE_JOINTS[-1] not in robot.joint_names or of_base is None:
         return table
     stream, vectors = of_base
-    of_imu = next(((s, of) for s, of in found if not {"gyro", "accelerometer"}.isdisjoint(of)), None)
+    of_imu = next(((s, of) for s, of in pairs if not {"gyro", "accelerometer"}.isdisjoint(of)), None)
     base: dict[str, object] = {k: [*vectors[k].values()] for k in ("position", "quaternion")}
     base |= {"stream": stream.name or None, "quaternion_order": "xyzw"}
     if "w" not in vectors["quaternion"]:

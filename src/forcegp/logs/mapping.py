@@ -529,7 +529,7 @@ def _check_base(mapping: Mapping, base: BaseSection) -> None:
         raise mapping.error(("base", "gyro"), "one angular velocity is needed", expected)
     if base.orientation_of == "imu" and base.imu_frame is None:
         raise mapping.error(("base", "orientation_of"), "key 'imu_frame' is missing", "a frame of the robot")
-    for given, needed, choice in (
+    for key, needed, choice in (
         ("quaternion", "quaternion_order", '"wxyz" or "xyzw"'),
         ("linear_velocity", "linear_axes", '"world" or "body"'),
         ("angular_velocity", "angular_axes", '"world" or "body"'),
@@ -537,8 +537,8 @@ def _check_base(mapping: Mapping, base: BaseSection) -> None:
         ("accelerometer", "imu_frame", "a frame of the robot"),
         ("accelerometer", "gravity", "true (proper acceleration), or false if gravity is removed"),
     ):
-        if getattr(base, given) is not None and getattr(base, needed) is None:
-            raise mapping.error(("base", given), f"key {needed!r} is missing", f"{needed} = {choice}")
+        if getattr(base, key) is not None and getattr(base, needed) is None:
+            raise mapping.error(("base", key), f"key {needed!r} is missing", f"{needed} = {choice}")
     for got, unsupported in (
         ("[servo]", mapping.sections.servo is not None),
         ("from_contact under [position]", bool(mapping.sections.position.from_contact)),

@@ -55,16 +55,18 @@ def find_modelled(
     for j in np.flatnonzero(smooth):
         inertial = np.column_stack([Y[:, j], qdd[:, j], np.ones(len(rows))])
         friction = np.column_stack([qd[:, j], np.tanh(qd[:, j] / RISE)])
-        left, less = (_left(X, tau[:, j]) for X in (inertial, np.column_stack([inertial, friction])))
-        sizes.append(left / max(float(np.sqrt(np.mean(tau[:, j] ** 2))), 1e-300))
-        ratios.append(left / max(less, 1e-300))
+        without_friction, with_friction = (
+            _unexplained(X, tau[:, j]) for X in (inertial, np.column_stack([inertial, friction]))
+        )
+        sizes.append(without_friction / max(float(np.sqrt(np.mean(tau[:, j] ** 2))), 1e-300))
+        ratios.append(without_friction / max(with_friction, 1e-300))
     if np.median(ratios) < FREE and np.median(sizes) < EXPLAINED:
         names = ", ".join(np.array(signals.joint_names)[smooth])
         text = f"the torque of {names} has neither noise nor friction: the output of a model or a simulator"
         report.find("modelled", text)
 
 
-def _left(X: Array, y: Array) -> float:
+def _unexplained(X: Array, y: Array) -> float:
     """Return the RMS residual of y `(n,)` for the columns X."""
     X = X / np.sqrt(np.mean(X**2, axis=0)).clip(min=1e-12)
     penalty = RIDGE * np.sqrt(len(X)) * np.eye(X.shape[1])

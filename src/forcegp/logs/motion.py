@@ -132,8 +132,8 @@ def check_base(signals: Signals, robot: RobotModel) -> None:
     for leaf in set(range(1, robot.nq)) - set(robot.parents):
         D = first @ old[:, leaf]
         for turn in (D, D.swapaxes(-1, -2)):
-            found = _half_turns(first @ new @ turn.swapaxes(-1, -2)) < SAME_ANGLE
-            changes |= found & (_half_turns(D) > BASE_JUMP)
+            turned = _half_turns(first @ new @ turn.swapaxes(-1, -2)) < SAME_ANGLE
+            changes |= turned & (_half_turns(D) > BASE_JUMP)
     if changes.any():
         places = describe(numbered(signals.row[rows[changes] + 1]))
         raise DataError(
@@ -172,7 +172,7 @@ def find_jumps(signals: Signals, report: ImportReport) -> None:
     """
     steps, moved = np.diff(signals.t), np.diff(signals.vectors["q"], axis=0)
     inner = np.diff(signals.segment) == 0
-    wraps = any(found.kind == "wrapped" for found in report.findings)
+    wraps = any(finding.kind == "wrapped" for finding in report.findings)
     if inner.sum() < NEIGHBOURS or (moved[inner] == 0.0).all(axis=1).mean() > MOST_HELD:
         return
     step = float(np.median(steps[inner]))

@@ -83,11 +83,11 @@ def spring_torque(signals: Signals, robot: RobotModel, mapping: Mapping, report:
     delay = search.delay() if search is not None and late else float(section.delay)
     if search is not None and unknown.any():
         stiffness = np.where(unknown, search.stiffness(delay, unknown), stiffness)
-        found = {name: float(f"{k:.4g}") for name, k in zip(joints, stiffness, strict=True)}
-        servo = section.model_copy(update={"stiffness": found})
+        stiffnesses = {name: float(f"{k:.4g}") for name, k in zip(joints, stiffness, strict=True)}
+        servo = section.model_copy(update={"stiffness": stiffnesses})
         mapping = replace(mapping, sections=mapping.sections.model_copy(update={"servo": servo}))
         stiffness = mapping.per_joint("servo", "stiffness", joints)
-        shown = ", ".join(f"{name} {found[name]:g}" for name in np.array(joints)[unknown])
+        shown = ", ".join(f"{name} {stiffnesses[name]:g}" for name in np.array(joints)[unknown])
         report.steps.append(f"found the stiffness from the motion and the masses of the robot file: {shown}")
     late_command = _shifted(signals, signals.vectors["command"], delay)
     known = np.asarray(np.isfinite(late_command).all(axis=1))
@@ -220,7 +220,9 @@ class _Search:
         Z = np.concatenate([_shifted(moved.signals, flat, s)[rows].reshape(shape) for s in EARLIER], axis=-1)
         speed = np.abs(moved.qd[rows])
         fast = speed > MOVING * np.sqrt(np.square(speed).mean(axis=0))
-        joints = [(j, own, _orthogonal(Z[own, j])) for j, own in enumerate(fast.T) if own.sum() > FEWEST]
+        joints = [
+            (j, moving, _orthogonal(Z[moving, j])) for j, moving in enumerate(fast.T) if moving.sum() > FEWEST
+        ]
         if not joints:
             text, hint = (
                 "the delay of the commands cannot be found",
@@ -242,13 +244,13 @@ class _Search:
             DataError: the delay is longer than `LONGEST`.
         """
 
-        def left(delay: float) -> float:
+        def misfit(delay: float) -> float:
             """Return the sum over the joints."""
             e, X = self.errors(delay), self.moved.columns[self.rows]
-            return sum(_unexplained(e[own, j], X[own, j], Q) for j, own, Q in self.joints)
+            return sum(_unexplained(e[moving, j], X[moving, j], Q) for j, moving, Q in self.joints)
 
         tried = np.arange(0.0, LONGEST, STEP)
-        best = tried[int(np.argmin([left(s) for s in tried]))]
+        best = tried[int(np.argmin([misfit(s) for s in tried]))]
         if best > LONGEST - 1.5 * STEP:
             raise DataError(
                 "the delay of the commands cannot be found",
@@ -257,7 +259,7 @@ class _Search:
                 hint="check the columns of the commands, or state it, as in delay = 0.15 under [servo]",
             )
         bounds = (max(0.0, best - 2.0 * STEP), best + 2.0 * STEP)
-        return float(scipy.optimize.minimize_scalar(left, bounds=bounds, method="bounded").x)
+        return float(scipy.optimize.minimize_scalar(misfit, bounds=bounds, method="bounded").x)
 
     def stiffness(self, delay: float, unknown: Array) -> Array:
         """Return 1/θ₁ (nq,), the stiffness of each joint, and NaN where it is not unknown.
@@ -265,22 +267,22 @@ class _Search:
         Raises:
             DataError: the links hardly resist the motion of a joint.
         """
-        found, names = np.full(len(unknown), np.nan), self.moved.signals.joint_names
+        values, names = np.full(len(unknown), np.nan), self.moved.signals.joint_names
         e, X = self.errors(delay), self.moved.columns[self.rows]
-        for j, own, Q in self.joints:
-            x, rest = Q.T @ X[own, j, 0], Q.T @ X[own, j, 1:]
+        for j, moving, Q in self.joints:
+            x, rest = Q.T @ X[moving, j, 0], Q.T @ X[moving, j, 1:]
             # What no other column explains of the first one, and θ₁ with its standard deviation
             alone = x - rest @ np.linalg.lstsq(rest, x, rcond=RANK)[0]
             power = float(alone @ alone)
             if power <= COLLINEAR**2 * float(x @ x):
                 continue
-            theta = float(alone @ (Q.T @ e[own, j])) / power
-            others = np.linalg.lstsq(rest, Q.T @ e[own, j] - theta * x, rcond=RANK)[0]
-            left = e[own, j] - theta * X[own, j, 0] - X[own, j, 1:] @ others
-            if theta > CLEAR * float(np.sqrt(np.square(left).mean() / power)):
-                found[j] = 1.0 / theta
+            theta = float(alone @ (Q.T @ e[moving, j])) / power
+            others = np.linalg.lstsq(rest, Q.T @ e[moving, j] - theta * x, rcond=RANK)[0]
+            residual = e[moving, j] - theta * X[moving, j, 0] - X[moving, j, 1:] @ others
+            if theta > CLEAR * float(np.sqrt(np.square(residual).mean() / power)):
+                values[j] = 1.0 / theta
         lacking = [
-            name for name, k, asked in zip(names, found, unknown, strict=True) if asked and np.isnan(k)
+            name for name, k, asked in zip(names, values, unknown, strict=True) if asked and np.isnan(k)
         ]
         if lacking:
             raise DataError(
@@ -289,7 +291,7 @@ class _Search:
                 got="hardly any force of links, or a joint that hardly moves",
                 hint=f"state it, as in stiffness = {{ {lacking[0]} = 20.0, … }} under [servo]",
             )
-        return found
+        return values
 
 
 def _is_held(signals: Signals) -> bool:

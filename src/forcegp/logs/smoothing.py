@@ -196,7 +196,7 @@ def _pieces(signals: Signals, least: int, report: ImportReport) -> NDArray[np.in
     length = np.repeat(lengths, lengths)
     if not (keep := length >= least).any():
         text = "no stretch of the log is long enough to compute accelerations"
-        text = next((found.message for found in report.findings if found.kind == "bursts"), text)
+        text = next((finding.message for finding in report.findings if finding.kind == "bursts"), text)
         expected = f"{least} rows without a gap in time{' or a contact switch' * bool(signals.contact)}"
         raise DataError(text, expected=expected, got=f"{len(signals)} rows in {len(lengths)} stretches")
     if not keep.all():

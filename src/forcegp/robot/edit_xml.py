@@ -93,9 +93,9 @@ class EditableXml:
         name = _TAG_NAME.match(self._data, at)
         assert name is not None
         values, end = {}, name.end()
-        while (found := _ATTRIBUTE.match(self._data, end)) is not None:
-            values[found[1].decode()] = (found.start(2), found.end(2), found.start())
-            end = found.end()
+        while (attribute := _ATTRIBUTE.match(self._data, end)) is not None:
+            values[attribute[1].decode()] = (attribute.start(2), attribute.end(2), attribute.start())
+            end = attribute.end()
         close = self._data.index(b">", end) + 1
         line = self._data[self._data.rfind(b"\n", 0, at) + 1 : at]
         indent = line if not line.strip() else b""

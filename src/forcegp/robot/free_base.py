@@ -70,8 +70,8 @@ def with_free_base(tree: Tree, floating: str | None = None) -> Tree:
 
 def without_drives(tree: Tree, base: Base) -> Tree:
     """Return the tree in which the joints of a free base have no drive."""
-    own = BASE_JOINTS if base == "free" else ()
-    joints = (replace(joint, driven=joint.driven and joint.name not in own) for joint in tree.joints)
+    base_joints = BASE_JOINTS if base == "free" else ()
+    joints = (replace(joint, driven=joint.driven and joint.name not in base_joints) for joint in tree.joints)
     return replace(tree, joints=tuple(joints))
 
 

@@ -80,8 +80,8 @@ def shapes_of(
         return rods(robot)
     path = robot_path(robot.name if source is None else source)
     root = parse_xml(read_bytes(path), str(path))
-    found = (_parts(root, path, robot, element) for element in elements if root.tag == "robot")
-    return next(filter(None, found), None) or rods(robot)
+    shapes = (_parts(root, path, robot, element) for element in elements if root.tag == "robot")
+    return next(filter(None, shapes), None) or rods(robot)
 
 
 def rods(robot: RobotModel) -> list[Shape]:

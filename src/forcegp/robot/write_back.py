@@ -181,17 +181,17 @@ def _joint_changes(writer: _Urdf | _Mjcf, tree: Tree, robot: RobotModel, file: R
         bristles = writer.has_laws and bool(per_joint(robot, "bristle")[i] > 0.0)
         names = (*names, *BRISTLE[1:]) if bristles else names
         pairs = {name: [float(per_joint(x, name)[i]) for x in (file, robot)] for name in names}
-        found = [Change(joint, name, *pair) for name, pair in pairs.items()]
-        found = [each for each in found if abs(each.after - each.before) > CHANGED * abs(each.before)]
-        own = vars(joints[joint]) | dict(zip(DRAG, joints[joint].drag, strict=True))
-        changed, values = {each.figure for each in found}, dict[str, str]()
-        written = {name: pair[1] - pair[0] + own[name] for name, pair in pairs.items()}
+        edits = [Change(joint, name, *pair) for name, pair in pairs.items()]
+        edits = [each for each in edits if abs(each.after - each.before) > CHANGED * abs(each.before)]
+        current = vars(joints[joint]) | dict(zip(DRAG, joints[joint].drag, strict=True))
+        changed, values = {each.figure for each in edits}, dict[str, str]()
+        written = {name: pair[1] - pair[0] + current[name] for name, pair in pairs.items()}
         bent = bristles and not changed.isdisjoint(BRISTLE)
         for figure, attribute in writer.figures.items():
             if figure in changed and not (figure == "friction" and bent):
                 if written[figure] < 0.0:
                     text = f"{writer.label}: the {figure} of joint {joint!r} is below that of its actuators"
-                    least, after = pairs[figure][0] - own[figure], pairs[figure][1]
+                    least, after = pairs[figure][0] - current[figure], pairs[figure][1]
                     raise RobotFileError(text, expected=f"at least {least:g}", got=after)
                 values[attribute] = _text(written[figure])
         curved = writer.has_laws and any(x for name in DRAG for x in pairs[name])
@@ -199,11 +199,13 @@ def _joint_changes(writer: _Urdf | _Mjcf, tree: Tree, robot: RobotModel, file: R
             # Without all three coefficients, the others are those of a default class.
             values["damping"] = _text(np.array([written[name] for name in ("damping", *DRAG)]))
         if bent:
-            values |= {"frictionloss": "0"} if own["friction"] else {}
-            writer.set_bristle(joint, own["friction"] - pairs["friction"][0], *(pairs[x][1] for x in BRISTLE))
+            values |= {"frictionloss": "0"} if current["friction"] else {}
+            writer.set_bristle(
+                joint, current["friction"] - pairs["friction"][0], *(pairs[x][1] for x in BRISTLE)
+            )
         if values:
             writer.set_joint(joint, values)
-        changes += found
+        changes += edits
     return changes
 
 
@@ -212,9 +214,9 @@ def _scale_changes(writer: _Urdf | _Mjcf, robot: RobotModel) -> tuple[list[Chang
     scales = () if robot.torque_scale is None else robot.torque_scale.tolist()
     changes, lacking = [], []
     for joint, scale in zip(robot.joint_names, scales, strict=False):
-        found = writer.scale_actuators(joint, scale) if abs(scale - 1.0) > CHANGED else []
-        changes += found
-        lacking += [] if found or abs(scale - 1.0) <= CHANGED else [f"{joint} {scale:.4g}"]
+        scaled = writer.scale_actuators(joint, scale) if abs(scale - 1.0) > CHANGED else []
+        changes += scaled
+        lacking += [] if scaled or abs(scale - 1.0) <= CHANGED else [f"{joint} {scale:.4g}"]
     text = f"no motor or servo in the file holds the scale of torques ({', '.join(lacking)})"
     return changes, (text,) if lacking else ()
 
@@ -264,9 +266,9 @@ def _parts(file: RobotModel, i: int, old: Mapping[str, Inertial | None]) -> list
         if parent == i and name in old:
             body = old[name] or NOTHING
             pose = torch.from_numpy(transform(R.numpy(), p.numpy()))
-            own = [torch.as_tensor(x, dtype=pose.dtype) for x in (body.mass, body.com, body.inertia)]
+            inertial = [torch.as_tensor(x, dtype=pose.dtype) for x in (body.mass, body.com, body.inertia)]
             # J = T J_own Tᵀ
-            J = pose @ pseudo_inertia(*own) @ pose.mT
+            J = pose @ pseudo_inertia(*inertial) @ pose.mT
             parts.append(_Part(name, pose, J, not (inertia_error(body) or inertia_doubt(body))))
     return sorted(parts, key=lambda part: -float(part.J[3, 3]))
 

@@ -181,8 +181,8 @@ def rollout_model(
         whole, report = torch.Size((samples, *batch)), share_of(progress, 1, shares)
         disturbance = model.disturbance if options.torque_noise else None
         noise = None if disturbance is None else (disturbance, generator)
-        given = force, system, start, tau, duration, whole, active, options, report
-        sampled = _run(*given, batch=batch, noise=noise, model=model)
+        arguments = force, system, start, tau, duration, whole, active, options, report
+        sampled = _run(*arguments, batch=batch, noise=noise, model=model)
         rollout = dataclasses.replace(rollout, samples=sampled)
     return _checked(rollout, options)
 

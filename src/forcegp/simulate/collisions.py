@@ -84,11 +84,11 @@ class Collisions:
 
     def pairs(self, q: Array) -> dict[str, float]:
         """Return the pairs of bodies closer than the clearance at q `(nq,)`, with their distances [m]."""
-        found: dict[str, float] = {}
+        distances: dict[str, float] = {}
         for k, pair in self._near(q):
             name = f"{self._names[pair[0]]} and {self._names[pair[1]]}"
-            found[name] = min(float(self._data.contact.dist[k]), found.get(name, np.inf))
-        return found
+            distances[name] = min(float(self._data.contact.dist[k]), distances.get(name, np.inf))
+        return distances
 
     def depth(self, q: Array) -> Array:
         """Return the violation of the clearance `(n,)` [m] at positions `(n, nq)`, or 0 if there is none."""

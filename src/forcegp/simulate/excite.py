@@ -290,9 +290,9 @@ class Search:
     def minimised(self, x: Array, steps: int) -> tuple[Array, float]:
         """Minimise the objective, and return the control points and the value of the objective."""
         options = {"maxfun": steps, "maxiter": steps, "maxcor": 20}
-        found = minimize(self, self.flat(x), jac=True, method="L-BFGS-B", options=options)
-        w = torch.from_numpy(found.x.reshape(len(self.spline.start), -1))
-        return (self.scale @ w[..., None])[..., 0].mT.numpy(), float(found.fun)
+        minimum = minimize(self, self.flat(x), jac=True, method="L-BFGS-B", options=options)
+        w = torch.from_numpy(minimum.x.reshape(len(self.spline.start), -1))
+        return (self.scale @ w[..., None])[..., 0].mT.numpy(), float(minimum.fun)
 
     @torch.no_grad()
     def used(self, x: Array, step: float) -> tuple[dict[str, float], Array]:
@@ -305,9 +305,9 @@ class Search:
             q = q + torch.from_numpy(self.spline.start)
             shares = limits.shares(q, qd, qdd, rigid_torque(self.unknowns.robot, q, qd, qdd))
             shares["clearance"] = 1.0 + torch.from_numpy(near.depth(q.numpy()))[:, None] / near.clearance
-            found = {name: share.abs().amax(-1).numpy() for name, share in shares.items()}
-            worst = {name: max(worst.get(name, 0.0), float(share.max())) for name, share in found.items()}
-            where.append(rows[np.max(list(found.values()), axis=0) > 1.0 + TOLERANCE])
+            largest = {name: share.abs().amax(-1).numpy() for name, share in shares.items()}
+            worst = {name: max(worst.get(name, 0.0), float(share.max())) for name, share in largest.items()}
+            where.append(rows[np.max(list(largest.values()), axis=0) > 1.0 + TOLERANCE])
         return worst, np.concatenate(where)
 
     def shrunk(self, x: Array, step: float) -> tuple[Array, dict[str, float]]:
@@ -422,15 +422,15 @@ def excite(
             criterion = CRITERIA[criterion]
         spline = Spline(_start_of(start, robot, limits, collisions), seconds)
         search = Search(spline, limits, unknowns, collisions, criterion)
-        found = _searched(search, restarts, np.random.default_rng(seed), progress or (lambda *_: None))
-        return _result(system, search, found, rate, seed)
+        best = _searched(search, restarts, np.random.default_rng(seed), progress or (lambda *_: None))
+        return _result(system, search, best, rate, seed)
 
 
-Found = tuple[tuple[float, ...], Array, dict[str, float]]
+Optimum = tuple[tuple[float, ...], Array, dict[str, float]]
 """Objectives of the optimised starts (best first), control points of the best, and used limits."""
 
 
-def _searched(search: Search, restarts: int, random: np.random.Generator, progress: Progress) -> Found:
+def _searched(search: Search, restarts: int, random: np.random.Generator, progress: Progress) -> Optimum:
     """Optimise random starts."""
     rounds = restarts + ROUNDS
     drawn = (search.spline.random(search.limits, random) for _ in range(4 * restarts))
@@ -456,9 +456,9 @@ def _searched(search: Search, restarts: int, random: np.random.Generator, progre
 
 
 @torch.no_grad()
-def _result(system: ConstrainedSystem, search: Search, found: Found, rate: float, seed: int) -> Excitation:
+def _result(system: ConstrainedSystem, search: Search, best: Optimum, rate: float, seed: int) -> Excitation:
     robot, spline, unknowns = search.unknowns.robot, search.spline, search.unknowns
-    values, x, used = found
+    values, x, used = best
     t = np.linspace(0.0, spline.seconds, round(spline.seconds * rate) + 1)
     q, qd, qdd = (torch.from_numpy(m @ x) for m in spline.at(t))
     q = q + torch.from_numpy(spline.start)

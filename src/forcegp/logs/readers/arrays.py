@@ -146,13 +146,13 @@ def variables(content: bytes, source: str) -> Iterator[Variable]:
     order = {b"IM": "<", b"MI": ">"}.get(content[126:128])
     if order is None:
         raise DataError(f"{source}: not a MATLAB file of versions 5 to 7", got=content[:20])
-    left = min(guards.allowed_bytes(len(content)), limits.TABLE_BYTES)
-    return _Reader(source, order, left).variables(memoryview(content))
+    allowed = min(guards.allowed_bytes(len(content)), limits.TABLE_BYTES)
+    return _Reader(source, order, allowed).variables(memoryview(content))
 
 
 class _Reader:
-    def __init__(self, source: str, order: str, left: int) -> None:
-        self.source, self.order, self.count, self.left = source, order, 0, left
+    def __init__(self, source: str, order: str, remaining: int) -> None:
+        self.source, self.order, self.count, self.remaining = source, order, 0, remaining
 
     def variables(self, content: memoryview) -> Iterator[Variable]:
         for element in self.elements(content[HEADER_BYTES:]):
@@ -163,13 +163,13 @@ class _Reader:
     def inflated(self, body: memoryview) -> memoryview:
         stream = zlib.decompressobj()
         try:
-            content = stream.decompress(body, max(self.left, 1))
+            content = stream.decompress(body, max(self.remaining, 1))
         except zlib.error as cause:
             raise self.damaged("compressed data", str(cause)) from cause
         if stream.unconsumed_tail:
-            text = f"a variable inflates to more than the {self.left:,} bytes that are left"
+            text = f"a variable inflates to more than the {self.remaining:,} bytes that are left"
             raise DataError(f"{self.source}: {text}")
-        self.left -= len(content)
+        self.remaining -= len(content)
         return memoryview(content)
 
     def elements(self, content: memoryview) -> Iterator[_Element]:

@@ -143,10 +143,10 @@ class Collector:
             listing = ", ".join(f"{topic} ({kind})" for topic, kind in topics.items())
             text, got = f"{source}: no messages of a supported type", listing[:600] or "no topics"
             raise DataError(text, expected=" or ".join(KINDS), got=got)
-        found = sorted(self._streams.values(), key=lambda s: (s.topic, -len(s.rows)))
-        origin = np.min([np.min(np.array(stream.stamps), axis=0) for stream in found], axis=0)
+        ordered = sorted(self._streams.values(), key=lambda s: (s.topic, -len(s.rows)))
+        origin = np.min([np.min(np.array(stream.stamps), axis=0) for stream in ordered], axis=0)
         streams = []
-        for topic, group in groupby(found, key=lambda stream: stream.topic):
+        for topic, group in groupby(ordered, key=lambda stream: stream.topic):
             for number, stream in enumerate(group, start=1):
                 streams.append(stream.stream(f"{topic}#{number}" if number > 1 else topic, origin, wanted))
                 stream.rows.clear()

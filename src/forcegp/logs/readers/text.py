@@ -408,8 +408,8 @@ def read_folder(path: Path, *, wanted: Wanted, rows: int | None, progress: Progr
     def in_file(file: Path, column: str) -> str:
         return f"{file.stem}[{column}]" if column.isdigit() else f"{file.stem}.{column}"
 
-    found = (p for p in path.iterdir() if p.suffix.lower() in ENDINGS and p.is_file())
-    files = guards.within(path, sorted(found))
+    tables = (p for p in path.iterdir() if p.suffix.lower() in ENDINGS and p.is_file())
+    files = guards.within(path, sorted(tables))
     guards.check_count(str(path), "files", len(files), limits.LOG_FILES)
     groups: dict[int, dict[str, Column]] = {}
     remarks: list[str] = []
