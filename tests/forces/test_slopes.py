@@ -101,7 +101,7 @@ def error_of(model: StructuredFit, seed: int) -> float:
 def test_learned_slopes_are_better(mean: str, monkeypatch: pytest.MonkeyPatch) -> None:
     learned = [fitted(seed, mean) for seed in SEEDS]
     assert all(model.training.slopes is not None for model in learned)
-    monkeypatch.setattr(steps, "ROUNDS", 0)
+    monkeypatch.setattr(steps, "RELEARNINGS", 0)
     of_file = [fitted(seed, mean) for seed in SEEDS]
     assert all(model.training.slopes is None for model in of_file)
     one, two = (sum(map(error_of, models, SEEDS)) for models in (learned, of_file))

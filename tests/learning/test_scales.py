@@ -15,7 +15,7 @@ from forcegp.forces.posterior import STICK_NOISE
 from forcegp.forces.unknowns import AXES
 from forcegp.learning.scales import (
     AT_REST,
-    FEWEST,
+    FEWEST_FOR_VARIANCE,
     Residuals,
     Stated,
     _at_likeliest_speed,
@@ -79,7 +79,7 @@ def test_variances_of_few_independent_samples_are_the_stated_ones() -> None:
         known = Stated(stated, power, torch.ones_like(stated), torch.zeros(8, dtype=torch.bool))
         return _at_likeliest_speed(data, contact, now, AT_REST, learned, known)[1:]
 
-    few = found(0.5 * FEWEST / ROWS)
+    few = found(0.5 * FEWEST_FOR_VARIANCE / ROWS)
     is_stated = few[1] == stated
     assert is_stated.tolist() == 2 * [*JOINTS * [False], True]
     torch.testing.assert_close(found(1.0)[1][:JOINTS].sqrt(), STD, rtol=SAMPLED, atol=0.03)

@@ -9,7 +9,13 @@ from torch import Tensor
 from forcegp.forces.priors.contact import SlidingFrictionPrior
 from forcegp.forces.priors.joint import JointForcePrior
 from forcegp.gp.features import Block
-from forcegp.learning.search import FAR, LIMITS, box_around, doubts_at_bounds, initial_hyperparameters
+from forcegp.learning.search import (
+    DEFAULT_RANGE,
+    LIMITS,
+    box_around,
+    doubts_at_bounds,
+    initial_hyperparameters,
+)
 
 N, ROWS = 50, 6
 
@@ -49,13 +55,17 @@ def test_learning_stays_around_its_start_and_says_where_it_ended_at_a_bound() ->
     }
     box = box_around(start, {**start, "joint.log_lengthscale": torch.tensor([20.0]).double()})
     low, high = box["joint.log_std"]
-    assert torch.equal(low, start["joint.log_std"] - FAR[0])
-    assert torch.equal(high, start["joint.log_std"] + FAR[1])
+    assert torch.equal(low, start["joint.log_std"] - DEFAULT_RANGE[0])
+    assert torch.equal(high, start["joint.log_std"] + DEFAULT_RANGE[1])
     assert float(box["joint.log_lengthscale"][1]) == 20.0, "where learning begins"
     assert box["coulomb.table.log_coefficient"] == LIMITS["log_coefficient"]
     assert doubts_at_bounds(start, box) == ()
-    ended = {**start, "joint.log_std": torch.stack([low[0], high[1]]), "noise.0.log_noise_std": torch.tensor(
-        [-2.3 - FAR[0]]).double(), "joint.log_lengthscale": torch.tensor([20.0]).double()}  # fmt: skip
+    ended = {
+        **start,
+        "joint.log_std": torch.stack([low[0], high[1]]),
+        "noise.0.log_noise_std": torch.tensor([-2.3 - DEFAULT_RANGE[0]]).double(),
+        "joint.log_lengthscale": torch.tensor([20.0]).double(),
+    }
     size, noise = doubts_at_bounds(ended, box)
     assert size.startswith("1 of 2 values of joint.log_std ended at their upper bound")
     assert noise.startswith("1 of 1 values of noise.0.log_noise_std ended at their lower bound")

@@ -13,7 +13,7 @@ import forcegp
 from forcegp.errors import ModelError, UnknownNameError
 from forcegp.forces.quantities import states
 from forcegp.forces.unknowns import (
-    REACH,
+    NORMAL_SPEED_STDS,
     share_at_rest,
     stated_tips,
     tip_factor,
@@ -156,7 +156,7 @@ def test_rest_is_told_by_the_speed_along_the_normal() -> None:
         at = states(system, log.q, log.qd + size * noise[:, None] * up[..., 0], log.tau, closed)
         speeds.append(float(stated_tips(system, [at])[tip_keys("table").speed].exp()))
     assert speeds[0] == pytest.approx(0.02)
-    assert speeds[1] == pytest.approx(REACH * wrong, rel=0.15)
+    assert speeds[1] == pytest.approx(NORMAL_SPEED_STDS * wrong, rel=0.15)
 
 
 def test_contacts_that_cannot_be_read() -> None:

@@ -238,7 +238,7 @@ FORCE_ROWS = 4000
 """Maximum number of contact rows at which forces are computed."""
 PULLS = 0.5
 """Fraction of contact rows with a pulling force above which the normal must be reversed."""
-SIGNIFICANT, LARGEST_FRICTION = 4.0, 2.0
+FRICTION_Z, LARGEST_FRICTION = 4.0, 2.0
 """Standard errors over blocks above which friction is significant; largest plausible friction coefficient."""
 SLIDING_SLOW, NARROW = 0.01, 0.05
 """Speed below which the direction of sliding is unknown [m/s]; minimum RMS speed across the main direction of
@@ -303,7 +303,7 @@ def _friction(finding: partial[Finding], path: Path, force: Array) -> list[Findi
     size = "not determined" if mean > LARGEST_FRICTION else f"about {100 * mean:.0f} % of the normal force"
     text = f"friction at {finding.keywords['contact']!r} while it slides is {size}"
     evidence = {"friction_coefficient": mean, "standard_error": error}
-    return [finding("contact-friction", text, evidence=evidence)] if mean > SIGNIFICANT * error else []
+    return [finding("contact-friction", text, evidence=evidence)] if mean > FRICTION_Z * error else []
 
 
 def _directions(finding: partial[Finding], v: Array) -> list[Finding]:

@@ -23,9 +23,9 @@ from forcegp.constraints import ConstrainedSystem
 
 ROWS, SCREENING, DELAYS = 1600, 4, 3
 """Number of rows used to test hypotheses; stride of the rows used for screening; delays kept per joint."""
-ROUNDS = 5
+MOST_FAULTS = 5
 """Maximum number of faults in the search."""
-SIGNIFICANT = 4.0
+SCORE_Z = 4.0
 """Required drop in the held-out score, in standard errors, since about a hundred hypotheses are compared."""
 SHARE, SAME = 0.03, 1e-3
 """Fraction of the best drop that a simpler hypothesis may miss; tolerance within which errors are equal."""
@@ -114,7 +114,7 @@ def explain(system: ConstrainedSystem, log: Log) -> Explanation:
     rows = log.rows(ROWS, margin=max(hypotheses.LAGS))
     problem = hypotheses.problem_of(system, log, rows)
     model = Explanation(system, log, rows, problem, np.zeros((*problem.r.shape, 0)), np.zeros(0)).weighed()
-    for _ in range(ROUNDS):
+    for _ in range(MOST_FAULTS):
         accepted = _round(model)
         if accepted is None:
             break
@@ -281,7 +281,7 @@ def significant(better: Array, worse: Array, concerned: int) -> bool:
     gains = gain_of(score_of(better), score_of(worse)), pooled_gain_of(better, worse)
     # A decrease in both means is required, since quiet blocks alone may cause a decrease in one.
     agree = all(gain > error for gain, error in gains)
-    return gains[0][0] > least and agree and any(gain > SIGNIFICANT * error for gain, error in gains)
+    return gains[0][0] > least and agree and any(gain > SCORE_Z * error for gain, error in gains)
 
 
 SMALL_MASS = 1e-6

@@ -236,7 +236,7 @@ CURRENT = 1.6
 """Median gain factor above which a different quantity must have been logged instead of the torque."""
 TILT = 30.0
 """Largest angle that counts as a tilt of the base; a larger one is a different mounting [degrees]."""
-WEIGHTLESS, SIGNIFICANT = 0.3, 3.0
+WEIGHTLESS, PARAMETER_Z = 0.3, 3.0
 """Fraction of gravity below which torques lack it; standard errors at which payload and offsets count."""
 SMALL_ANGLE, LARGEST_ANGLE = np.radians(0.5), 1.0
 """Encoder offset below which calibration or the centres of mass may be the cause; offset above which a
@@ -263,7 +263,7 @@ DISCRETE = {
 def plausible(system: ConstrainedSystem, hypothesis: Hypothesis, fit: TorqueFit) -> bool:
     """Return whether the parameters are physically plausible. For example, tool mass must be positive."""
     if hypothesis.name == "encoder-offset":
-        least = max(SMALL_ANGLE, SIGNIFICANT * fit.spread[0])
+        least = max(SMALL_ANGLE, PARAMETER_Z * fit.spread[0])
         return bool(least < abs(fit.theta[0]) <= LARGEST_ANGLE)
     if hypothesis.name == "torque-without-model":
         # Wrong accelerations would fit better without a model too, so friction must explain each joint.
@@ -283,11 +283,11 @@ def plausible(system: ConstrainedSystem, hypothesis: Hypothesis, fit: TorqueFit)
         same = abs(size - 1.0) <= SAME_GRAVITY[angle > TILT]
         return bool(size < WEIGHTLESS) or (angle > SMALL_TILT and same)
     if hypothesis.name == "drift":
-        return bool(abs(fit.theta[0]) > SIGNIFICANT * fit.spread[0])
+        return bool(abs(fit.theta[0]) > PARAMETER_Z * fit.spread[0])
     if hypothesis.name == CHANGE:
-        return bool(abs(fit.theta[0]) > SIGNIFICANT * fit.spread[0])
+        return bool(abs(fit.theta[0]) > PARAMETER_Z * fit.spread[0])
     if hypothesis.name == "payload":
-        known = abs(fit.theta[0]) > SIGNIFICANT * fit.spread[0]
+        known = abs(fit.theta[0]) > PARAMETER_Z * fit.spread[0]
         return bool(known and fit.theta[0] > -float(system.robot.mass[-1]))
     return True
 

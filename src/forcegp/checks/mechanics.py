@@ -31,7 +31,7 @@ MODELLED, TOUCHED = 0.02, 0.1
 rows in contact, or with friction above twice that difference, that would show in a measured torque."""
 LEAST_ROWS = 200
 """Minimum number of rows for checking the dynamics."""
-SIGNIFICANT, MATERIAL = 3.0, 0.1
+DROP_Z, MATERIAL = 3.0, 0.1
 """Standard errors over blocks, and drop in a joint's log error, above which friction or offsets count."""
 SPEEDS, UNEXPLAINED = (25.0, 95.0), 0.5
 """Percentiles of speed at which friction must oppose motion; accepted RMS fraction of unexplained torque."""
@@ -141,7 +141,7 @@ def _worse(explanation: Explanation, other: TorqueFit, j: int) -> bool:
     """Return whether another fit has a significantly larger error at joint j."""
     floor = FLOOR * explanation.problem.size[j] / explanation.problem.scale[j]
     gain, error = gain_of(*(np.log(np.hypot(fit.error[:, j], floor)) for fit in (explanation.fit, other)))
-    return gain > MATERIAL and gain > SIGNIFICANT * error
+    return gain > MATERIAL and gain > DROP_Z * error
 
 
 def _determined(explanation: Explanation) -> Explanation:

@@ -33,19 +33,19 @@ from forcegp.types import ConstraintInverse, ConstraintMatrix, ConstraintVector,
 
 RANK_TOLERANCE = 1e-5
 """Singular value of A G⁻ᵀ with M = G Gᵀ, relative to the largest, below which constraints are redundant."""
-ROUNDING = 1e3
+RANK_ROUNDING = 1e3
 """The same threshold in units of the machine epsilon ε, used if it is larger: 1.2e-4 in single precision.
 Redundant contacts of the bundled arms give 2 ε; closed loops and ill-conditioned M give more."""
 
 
 def rank_tolerance(dtype: torch.dtype) -> float:
     """Return the relative singular value of A G⁻ᵀ below which a constraint is redundant."""
-    return max(RANK_TOLERANCE, ROUNDING * torch.finfo(dtype).eps)
+    return max(RANK_TOLERANCE, RANK_ROUNDING * torch.finfo(dtype).eps)
 
 
 def nothing(dtype: torch.dtype) -> float:
     """Return the norm below which a row of A G⁻ᵀ is treated as zero [1/√kg] because its point cannot move."""
-    return ROUNDING * torch.finfo(dtype).eps
+    return RANK_ROUNDING * torch.finfo(dtype).eps
 
 
 FACING_DOWN = 1e-6

@@ -22,7 +22,7 @@ APPROACH = 1e-9
 """Value of −ċ above which a contact closes [m/s]; after an impact, ċ is zero up to rounding error."""
 POSITION_TOLERANCE = 1e-12
 """Largest constraint error considered zero [m]; rounding errors in an arm's kinematics are near 1e-15 m."""
-ROUNDING = 100.0
+POSITION_ROUNDING = 100.0
 """Constraint error caused by rounding, in units of the machine epsilon; relevant only in float32."""
 MAX_ITERATIONS = 30
 """Maximum number of Newton iterations; four are needed for a state one centimetre from the surface."""
@@ -119,7 +119,7 @@ def project_state(
         NumericalError: the iteration does not converge, for example if the surface is out of reach.
     """
     rows = system.active_rows(active, q.shape[:-1])
-    tolerance = max(POSITION_TOLERANCE, ROUNDING * torch.finfo(q.dtype).eps)
+    tolerance = max(POSITION_TOLERANCE, POSITION_ROUNDING * torch.finfo(q.dtype).eps)
     error = 0.0
     for _ in range(MAX_ITERATIONS):
         eom = system.equations(q, qd, active)

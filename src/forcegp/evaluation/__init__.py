@@ -53,9 +53,9 @@ __all__ = ["Evaluation", "evaluate"]
 
 GRAVITY_ALONE, LEAST_RESPONSE = 0.99, 0.5
 """Fraction of torque due to gravity above which data are a weak test; minimum response to an added torque."""
-FAR, SUPPORTED = 2.0, 0.7
-"""Acceleration errors relative to the error of the mean: above `FAR`, a joint is far worse than the mean;
-below `SUPPORTED`, the log supports an inertia that differs from that of the robot file."""
+FAR_WORSE, SUPPORTED = 2.0, 0.7
+"""Acceleration errors relative to the error of the mean: above `FAR_WORSE`, a joint is far worse than the
+mean; below `SUPPORTED`, the log supports an inertia that differs from that of the robot file."""
 
 
 @dataclass(frozen=True)
@@ -152,7 +152,7 @@ class Evaluation:
             sentences.append(
                 f"Gravity alone explains {share} of the torque, so the data hardly test anything else."
             )
-        if far := self._beyond_mean(FAR):
+        if far := self._beyond_mean(FAR_WORSE):
             units = "rad/s², or m/s² for sliding joints"
             text = ", ".join(
                 f"{joint} {model:.3g} (mean: {mean:.3g})" for joint, (model, mean) in far.items()

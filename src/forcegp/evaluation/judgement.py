@@ -17,7 +17,7 @@ from torch import Tensor
 from forcegp import dynamics
 from forcegp.checks.explain import significant
 from forcegp.checks.fit import cross_validate
-from forcegp.checks.hypotheses import SIGNIFICANT, problem_of, robot_columns
+from forcegp.checks.hypotheses import PARAMETER_Z, problem_of, robot_columns
 from forcegp.checks.log import evenly, log_of
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
@@ -143,7 +143,7 @@ def payload_change(model: FittedModel, error: Tensor, data: Dataset) -> PayloadC
     columns, prior = robot_columns(system, log, rows, "payload")
     null, fit = cross_validate(problem), cross_validate(problem, columns, prior)
     change = PayloadChange(float(fit.theta[0]), float(fit.spread[0]))
-    clear = abs(change.mass) > SIGNIFICANT * change.std
+    clear = abs(change.mass) > PARAMETER_Z * change.std
     return change if clear and significant(fit.shares, null.shares, data.nq) else None
 
 

@@ -247,7 +247,7 @@ def excluded(dropped: int) -> tuple[str, ...]:
     return (f"{text} (`forcegp check` names other spikes)",) if dropped else ()
 
 
-FAR = 6.0
+IMPACT_STDS = 6.0
 """Number of robust standard deviations of A q̈ − b above which a sample is not in persistent contact."""
 
 
@@ -280,7 +280,7 @@ def _persists(system: ConstrainedSystem, m: Measurement, std: Tensor) -> Tensor:
         in_contact = closed[:, row]
         if bool(in_contact.any()):
             scale = max(1.0, MAD_TO_STD * float(ratio[in_contact, row].median()))
-            good &= ratio[:, row] <= FAR * scale
+            good &= ratio[:, row] <= IMPACT_STDS * scale
     return good
 
 

@@ -29,7 +29,7 @@ from forcegp.constraints import ConstrainedSystem
 from forcegp.forces.measurements import Training
 from forcegp.forces.priors.base import CONSTRAINT, CONTACT, JOINT, NOISE, ForceMean, ForcePrior
 from forcegp.forces.priors.contact import CoulombFriction, coupled, with_coulomb
-from forcegp.forces.quantities import OPEN, AffineMap, States, affine_map, hidden_forces
+from forcegp.forces.quantities import DOUBTS, AffineMap, States, affine_map, hidden_forces
 from forcegp.forces.term import JointTerm
 from forcegp.gp.draws import FunctionSamples
 from forcegp.gp.exact import ExactPosterior
@@ -301,7 +301,7 @@ def draw_samples(
 
 CORRELATION_STATES = 50
 """Number of training states at which a fit evaluates the correlation of Q and Q_z."""
-FAR = 0.02
+QUESTIONABLE_DISTANCE = 0.02
 """Distance from the surface above which a closed contact is questionable [m]."""
 UNDETERMINED = 10.0
 """Relative standard deviation of the multiplier above which a fit issues a warning."""
@@ -352,7 +352,7 @@ def doubts_of(
             f"contact {name} is closed up to {1e3 * c:.3g} mm off its surface: check surface, point and "
             "labels (`forcegp check`)"
             for name, c in zip(names, off, strict=True)
-            if c > FAR
+            if c > QUESTIONABLE_DISTANCE
         )
         mean, covariance = posterior.read(system, at, affine_map(system, at, "multiplier"))
         loaded, hidden = at.eom.holds, hidden_forces(system, at, {"multiplier": slice(0, system.m)})
@@ -367,7 +367,7 @@ def doubts_of(
     if means and len(torch.cat(means)):
         warnings += _on_multiplier(torch.cat(means), torch.cat(variances))
     never = training.never_closed(system)
-    warnings += (OPEN[0].format(", ".join(never)),) if never else ()
+    warnings += (DOUBTS[0].format(", ".join(never)),) if never else ()
     residual = (posterior.latent.residual / power) ** 0.5
     if residual > MISSED:
         warnings += (

@@ -275,7 +275,7 @@ def affine_maps(
 
 ROUNDED = 1e-6
 """Tolerance for deciding that entries of the projector onto hidden multipliers are 0 or 1."""
-OPEN = (
+DOUBTS = (
     "contact {} is never closed in the training data: its force is not determined",
     "the point of contact {} cannot move in the direction of its force, which is not determined",
     "contacts {} hold the robot in the same direction: only the sum of their forces is determined",
@@ -346,7 +346,7 @@ def hidden_forces(
             whole[:, rows] = unseen.any()
     if bool(whole.all()) and any(cases[0]):
         raise ModelError(
-            OPEN[0].format(", ".join(never)),
+            DOUBTS[0].format(", ".join(never)),
             expected="motion in contact in the training data",
             hint="check the position of its surface (`forcegp check`), or, for forces learned in free "
             "motion, pass the system with the contact to `predict`",
@@ -354,7 +354,7 @@ def hidden_forces(
     listed = (
         ", ".join(dict.fromkeys(n for n, hit in zip(names, hits, strict=True) if hit)) for hits in cases
     )
-    doubts = tuple(text.format(contacts) for text, contacts in zip(OPEN, listed, strict=True) if contacts)
+    doubts = tuple(text.format(contacts) for text, contacts in zip(DOUBTS, listed, strict=True) if contacts)
     seen = ((1.0 - part) * shares).sum(-1) * len({"multiplier", "contact_force"} & set(parts))
     shared = C @ (R * shares[..., None]) @ C.mT
     return Hidden(whole, shared, seen, doubts) if bool(whole.any() | shared.any()) else None

@@ -33,7 +33,7 @@ AXES = 3
 LARGEST_COEFFICIENT = 1.0
 """Stated ratio of s to the typical normal force: friction at rest is at most μ λ, with μ ≤ 1 for most dry
 materials. It holds if fewer than ten independent samples are at rest (`learning/scales.py`)."""
-REACH = 3.0
+NORMAL_SPEED_STDS = 3.0
 """Ratio of v_s to the standard deviation of the normal speed of a closed contact. A real leg has an apparent
 normal speed of .03 to .04 m/s. Its fore-aft errors are 1.55 times those of the equations of motion with 1,
 1.11 with 2, 1.00 with 3, and .96 with 5. Simulated contacts have no normal speed."""
@@ -98,8 +98,8 @@ def stated_tips(system: ConstrainedSystem, states: Iterable[States]) -> dict[str
     """Return initial values for each contact, from normal forces at states under the robot file and τ.
 
     Contacts that share a load have λ_i/√(1 − R_ii) with the projector R onto Aᵀμ = 0, so that the variance of
-    their common tangential force is that of one contact. v_s is at least `REACH` times the standard deviation
-    of the speed along the normal.
+    their common tangential force is that of one contact. v_s is at least `NORMAL_SPEED_STDS` times the
+    standard deviation of the speed along the normal.
     """
     tips, loads, normal = {}, list[tuple[Tensor, Tensor]](), dict[str, list[Tensor]]()
     for at in states:
@@ -117,7 +117,7 @@ def stated_tips(system: ConstrainedSystem, states: Iterable[States]) -> dict[str
         load = torch.cat([force[active[:, index], row] for active, force in loads])
         if len(load) and bool((load > 0.0).any()):
             s = LARGEST_COEFFICIENT * float(load.square().mean().sqrt())
-            speed = REACH * MAD_TO_STD * float(torch.cat(normal[name]).abs().median())
+            speed = NORMAL_SPEED_STDS * MAD_TO_STD * float(torch.cat(normal[name]).abs().median())
             stated = RELATIVE * s, s, max(STICKING, speed)
             values = (system.robot.mass.new_tensor(math.log(x)) for x in stated)
             tips |= dict(zip(tip_keys(name), values, strict=True))

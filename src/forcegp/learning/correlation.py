@@ -27,7 +27,7 @@ CHUNK_STATES = 2000
 """Number of states for which residuals are computed at a time, to limit memory use."""
 NEGLIGIBLE = 0.05
 """Autocorrelation below which an estimate is considered noise."""
-SIGNIFICANT = 2.0
+COVARIANCE_Z = 2.0
 """Number of standard errors above which the covariance of neighbouring samples is significant."""
 WINDOW, WINDOWS = 10.0, 20
 """Window length in `correlation_times`, in autocorrelation times, and minimum number of windows."""
@@ -46,7 +46,7 @@ def autocorrelation_time(x: Tensor, segment: Tensor, white: Tensor | float = 0.0
     longest = int(segment.unique(return_counts=True)[1].max())
     variance, first = _variance_in_time(x, segment, white)
     total = torch.ones_like(variance)
-    open_ = first > SIGNIFICANT * x.square().mean(0) / math.sqrt(len(x))
+    open_ = first > COVARIANCE_Z * x.square().mean(0) / math.sqrt(len(x))
     for lag in range(1, longest // 2):
         rho = (first if lag == 1 else _covariance(x, segment, lag)) / variance
         open_ = open_ & (rho > NEGLIGIBLE)

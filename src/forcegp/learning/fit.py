@@ -41,7 +41,7 @@ LEARN_SAMPLES_INDUCING = 400
 """Number of samples for learning hyperparameters by exact inference if the log needs sparse inference."""
 FIRST_POWER = 0.25
 """Exponent of the tempered likelihood before the correlation of the residuals is known."""
-ROUNDS = 3
+RELEARNINGS = 3
 """Maximum number of times that hyperparameters are relearned after updates based on the residuals."""
 
 
@@ -140,7 +140,7 @@ def _of_kernels(
     """Search for hyperparameters of kernels on part of the samples.
 
     The residuals determine the exponent of the tempered likelihood, the slopes that propagate state noise,
-    and the sample weights. Whenever these change, hyperparameters are relearned, at most `ROUNDS` times.
+    and the sample weights. Whenever these change, hyperparameters are relearned, at most `RELEARNINGS` times.
     """
     part, report = subset(spec, problem), reported(progress, search.options.max_evaluations)
     if part.inducing is None:
@@ -152,7 +152,7 @@ def _of_kernels(
     sloped = part.state_std is not None
     sloped &= not is_sparse(spec.options.inference, part.priors, problem.training.all_samples)
     warnings: list[str] = []
-    for number in range(ROUNDS):
+    for number in range(RELEARNINGS):
         before = part
         if sloped:
             part, outcome, doubts = with_learned_slopes(part, search, outcome, report)

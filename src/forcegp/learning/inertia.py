@@ -130,6 +130,10 @@ def rigid_robot(robot: RobotModel, rows: Rows) -> Inertia:
     return Inertia(robot, remaining)
 
 
+FURTHER_ESTIMATES = 2
+"""Number of further estimates of the scales for identified links, each with those of the previous one."""
+
+
 def rescaled_robot(robot: RobotModel, rows: Rows, std: float) -> Inertia:
     """Return the robot with the inertia and the scales 1 + s of torques that a log determines.
 
@@ -143,7 +147,7 @@ def rescaled_robot(robot: RobotModel, rows: Rows, std: float) -> Inertia:
     """
     scale, spread, beyond = torque_scale(robot, rows, std)
     inertia = rigid_robot(robot, rows.scaled(scale))
-    for _ in range(ROUNDS if IDENTIFIED in inertia.doubts else 0):
+    for _ in range(FURTHER_ESTIMATES if IDENTIFIED in inertia.doubts else 0):
         # Y π for the changed links
         before, after = (inertial_parameters(x.mass, x.com, x.inertia) for x in (robot, inertia.robot))
         change = (links_at(robot, rows) @ (after - before).flatten()[:, None])[..., 0]
@@ -393,8 +397,6 @@ UNDETERMINED = 0.5
 LEAST_GAIN, FARTHEST = 0.1, 3.0
 """Least g, and stated standard deviations beyond which a scale stays nominal, as the torque of the links is
 too small to show it. Without this, one of 104 simulated torques from currents becomes ten times as large."""
-ROUNDS = 2
-"""Number of further estimates of the scales for identified links, each with those of the previous one."""
 GAIN = 0.02
 """Relative standard deviation of the gain of a torque sensor, up to 2 % in data sheets of strain gauges."""
 CLEAR = 3.0

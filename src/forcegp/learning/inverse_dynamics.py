@@ -40,13 +40,13 @@ RIDGE = 1e-4
 """Ridge penalty on the scaled friction columns, relative to the number of samples. If a joint hardly moves,
 its columns are nearly collinear. On held-out blocks of seven training logs, torque errors are 0.65 (Kinova),
 0.77 (iiwa) and 0.98 to 1.01 times those with 1e-8. With 1e-3, they are 0.88 to 1.10 times as large."""
-SIGNIFICANT = 2.0
+DIFFERENCE_Z = 2.0
 """Number of standard errors above which a difference is significant. If they are estimated from few blocks,
 Student's t distribution applies: for eight blocks, the threshold is 2.43. With 2.0, the correct robot file
 was replaced for one of 30 simulated contact logs, and force errors were 7 times as large."""
 APART = 0.05
 """Time between a sample and its partner [s], unless the acceleration filter spans a longer time."""
-REACH = 3.0
+TRUNCATION_STDS = 3.0
 """Number of standard deviations at which Gaussian weights are truncated."""
 LEAST_SQUARE = 1e-300
 """Lower bound on mean squares, for joints that do not move during a block and therefore have no error."""
@@ -354,7 +354,7 @@ def averaged(rows: Rows, columns: Tensor, inertial: Tensor, width: float) -> tup
     """
     stds = [x / rows.step for x in (width, math.hypot(width, math.sqrt(rows.filter_variance)))]
     n = rows.leading
-    reach, stride = min(math.ceil(REACH * stds[1]), (n - 1) // 2), max(1, int(0.5 * stds[0]))
+    reach, stride = min(math.ceil(TRUNCATION_STDS * stds[1]), (n - 1) // 2), max(1, int(0.5 * stds[0]))
     offset = torch.arange(-reach, reach + 1).to(columns)
     narrow, wide = (torch.softmax(-0.5 * (offset / max(std, 1e-9)) ** 2, 0) for std in stds)
     starts = range(0, len(rows.q), n)
@@ -481,5 +481,5 @@ def is_harmless(after: Tensor, before: Tensor) -> bool:
 def is_less(difference: Tensor) -> bool:
     """Return whether the mean of differences `(groups,)` is significantly below zero (Student's t test)."""
     n = len(difference)
-    least = float(scipy.special.stdtrit(n - 1, scipy.special.ndtr(SIGNIFICANT)))
+    least = float(scipy.special.stdtrit(n - 1, scipy.special.ndtr(DIFFERENCE_Z)))
     return float(difference.mean()) < -least * float(difference.std()) / math.sqrt(n)

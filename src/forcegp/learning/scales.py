@@ -46,7 +46,7 @@ from forcegp.learning.evidence import (
     without_idle,
 )
 
-ROUNDS, SETTLED, NEGLIGIBLE = 20, 0.02, 1e-3
+ALTERNATIONS, SETTLED, NEGLIGIBLE = 20, 0.02, 1e-3
 """Maximum number of alternations, and largest changes of σ_j at their end, relative to σ_j and to all σ."""
 STEPS, ACCURACY, DIVISIONS = 50, 1e-3, 16
 """Maximum number of steps of Fisher scoring in one alternation, relative change at which they end, and
@@ -56,7 +56,7 @@ LEAST_VARIANCE = EXACT**2
 AT_REST = (0.02, 0.05, 0.1)
 """Speeds v_s below which a joint or contact is nearly at rest, of which the likeliest is taken [rad/s, m/s]:
 the resolution of common encoders, and speeds at which joints reverse within a sampling period."""
-FEWEST = 10.0
+FEWEST_FOR_VARIANCE = 10.0
 """Number of samples below which a variance has its stated value. Of static friction, samples at rest count,
 and of the unknown force of a contact that slides, samples in contact. Those of contacts count κ times. If κ
 applied to joints too, errors on held-out blocks of the training logs of a UR10 and a UR3 would be 2 % larger,
@@ -152,7 +152,7 @@ def _moved(scales: Scales, evidence: Evidence) -> Scales:
 
 def _alternated(scales: Scales, noisy: bool) -> Scales:
     """Alternate between scales and noise until neither changes."""
-    for number in range(ROUNDS):
+    for number in range(ALTERNATIONS):
         _, sums = _sums(scales.problem, scales.values)
         scales = _moved(scales, fixed_point(sums, scales.groups, scales.stated, scales.kept))
         scales = replace(scales, rounds=scales.rounds + 1, converged=not noisy)
@@ -366,7 +366,7 @@ def _at_likeliest_speed(
         slow = whole.slow.clone()
         slow[:, columns] = slow[:, columns] ** (2.0 * (now - speed)).exp()
         rows = whole._replace(slow=slow)
-        free = (torch.cat(_independent(rows, stated.power)) >= FEWEST) & ~stated.known
+        free = (torch.cat(_independent(rows, stated.power)) >= FEWEST_FOR_VARIANCE) & ~stated.known
         settled = _settled(rows, torch.where(free, theta, stated.theta), stated.share, free)
         tried.append((rows.log_density(*settled.chunk(2)), rows, speed, settled))
     return max(tried, key=lambda each: each[0])[1:]

@@ -44,10 +44,10 @@ LIMITS = {
     "log_smoothing": (math.log(1e-4), math.log(0.1)),
 }
 """Bounds on the hyperparameters that have an absolute scale."""
-REACH = {"log_lengthscale": (4.0, 8.0)}
-"""Range of the other hyperparameters below and above their initial values, in e-folds; `FAR` if not listed.
-An input becomes irrelevant if its length-scale is 8 e-folds above the initial value."""
-FAR = (7.0, 7.0)
+RANGES = {"log_lengthscale": (4.0, 8.0)}
+"""Range of the other hyperparameters below and above their initial values, in e-folds; `DEFAULT_RANGE` if not
+listed. An input becomes irrelevant if its length-scale is 8 e-folds above the initial value."""
+DEFAULT_RANGE = (7.0, 7.0)
 AT_BOUND = 1e-6
 """Distance from a bound, in e-folds, within which a learned value is considered to be at the bound."""
 WIDTH = {
@@ -232,7 +232,7 @@ def box_around(
     """
     box: dict[str, tuple[float | Tensor, float | Tensor]] = {}
     for key, x in start.items():
-        below, above = REACH.get(_kind(key), FAR)
+        below, above = RANGES.get(_kind(key), DEFAULT_RANGE)
         y = x if begin is None else begin[key]
         box[key] = torch.minimum(x - below, y), torch.maximum(x + above, y)
     return {**box, **limits_of(start)}

@@ -49,13 +49,13 @@ from forcegp.robot.write_back import BRISTLE, DRAG, is_mjcf, per_joint, write_ro
 
 SPEEDS, POSES = 20, 20
 """Number of speeds in each direction, and number of poses, at which friction is evaluated."""
-SLOWEST = 0.05
+SLOWEST_SHARE = 0.05
 """Smallest of these speeds relative to the largest trained speed. Dry friction is smoothed below it."""
 UNTRAINED = 1.0
 """Largest speed that is assumed if the trained speeds are unknown [rad/s, m/s]."""
 DRAWS, DRAWN = 400, 4000
 """Number of function samples from which standard deviations are computed, and from which covariances are."""
-OPEN = 2.0
+UNDETERMINED_STDS = 2.0
 """Number of standard deviations from zero within which an offset counts as undetermined."""
 DETERMINED = 0.5
 """Standard deviation, relative to the prior's or to the value, below which a parameter is determined."""
@@ -354,7 +354,7 @@ class _Reader:
             fastest = torch.full_like(robot.mass, UNTRAINED)
             if LOW in values:
                 fastest = torch.maximum(-values[LOW][0], values[HIGH][0]).clamp(min=1e-6)
-        up = torch.linspace(SLOWEST, 1.0, SPEEDS, dtype=robot.dtype, device=robot.device)
+        up = torch.linspace(SLOWEST_SHARE, 1.0, SPEEDS, dtype=robot.dtype, device=robot.device)
         speeds = torch.cat([-up.flip(0), up])[:, None] * fastest
         return cls(fit, speeds, cls._at(fit, speeds, seed), seed, gain_std)
 
@@ -615,7 +615,7 @@ def _offset_gain(offset: Tensor, mean: Tensor, values: Tensor) -> Tensor:
     E[z | c = 0] = z − Cov(z, c) Cov(c)⁻¹ c, with the covariances of the samples, which are the rows of
     `offset` and `values` after the first. The posterior mean `(nq,)` of the offsets is compared with zero.
     """
-    c = (offset[1:] - offset[1:].mean(0)) * (mean.abs() <= OPEN * offset[1:].std(0))
+    c = (offset[1:] - offset[1:].mean(0)) * (mean.abs() <= UNDETERMINED_STDS * offset[1:].std(0))
     return torch.linalg.pinv(c.mT @ c, hermitian=True) @ c.mT @ (values[1:] - values[1:].mean(0))
 
 

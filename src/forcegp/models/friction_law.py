@@ -31,11 +31,11 @@ RATE = 4.0
 """Ratio of acceleration to speed of the motions [1/s]."""
 COUNT, LEVELS = 16, (3, 6, 9, 12, 15)
 """Number of speeds, and those among them that are the largest of a motion."""
-SLOWEST = 2.0 * SHARPEST
+SLOWEST_SPEED = 2.0 * SHARPEST
 """Smallest speed [rad/s, m/s]. Below it, learned dry friction is smoothed."""
 PHASES = 200
 """Steps in which a bristle is followed from one reversal to the next."""
-OPEN = 2.0
+DETERMINED_STDS = 2.0
 """Number of standard deviations from zero of memory, and of (b, c) and s, that count as determined."""
 GRID, WIDER = 7, 1.0
 """Number of starting values of δ, s/f and v_s, and how far the search may leave their range [log]."""
@@ -62,7 +62,7 @@ class Reversals:
     @classmethod
     def of(cls, fastest: Tensor) -> Reversals:
         """Return the states for the fastest speeds `(nq,)`."""
-        slowest = torch.minimum(torch.full_like(fastest, SLOWEST), 0.25 * fastest)
+        slowest = torch.minimum(torch.full_like(fastest, SLOWEST_SPEED), 0.25 * fastest)
         share = torch.linspace(0.0, 1.0, COUNT).to(fastest)[:, None]
         rows = [(k, m, late) for m in LEVELS for k in range(m + 1) for late in (0, 1)]
         k, m, late = torch.tensor(rows, device=fastest.device).T
@@ -156,8 +156,8 @@ class _Joint:
         """Return the δ, s/f and v_s of the closest law for any d, b, c, f and offset, found from a grid."""
         Q, _ = np.linalg.qr(powers)
         rest = y - Q @ (Q.T @ y)
-        fast = max(SLOWEST, 0.5 * np.abs(self.v).max())
-        ranges = np.log([(DISTANCES[0] / 3.0, 3.0 * DISTANCES[-1]), EXCESS, (0.5 * SLOWEST, fast)])
+        fast = max(SLOWEST_SPEED, 0.5 * np.abs(self.v).max())
+        ranges = np.log([(DISTANCES[0] / 3.0, 3.0 * DISTANCES[-1]), EXCESS, (0.5 * SLOWEST_SPEED, fast)])
         free = np.array([bends, peaked, peaked])
         if not free.any():
             return 0.0, 0.0, 1.0
@@ -262,7 +262,7 @@ def laws_of(at: Reversals, sliding: Tensor, memory: Tensor | None = None, *, sta
         if memory is not None:
             past = memory[..., j].cpu().numpy()
             past = np.concatenate([-past, past], axis=1)
-            bends = _rms(past[0]) > OPEN * _rms(past[1:] - past[0])
+            bends = _rms(past[0]) > DETERMINED_STDS * _rms(past[1:] - past[0])
             y = y + past if bends else y
         candidates = []
         for curved, peaked in product((False, True), repeat=2):
@@ -270,7 +270,7 @@ def laws_of(at: Reversals, sliding: Tensor, memory: Tensor | None = None, *, sta
                 law, rest = joint.law(y[0], bends, curved, peaked)
                 samples = joint.sampled(law, y, bends, curved, peaked)
                 extra = [*((1, 2) if curved else ()), *((4,) if peaked else ())]
-                if _distance(law[extra], samples[:, extra]) > OPEN or not extra:
+                if _distance(law[extra], samples[:, extra]) > DETERMINED_STDS or not extra:
                     candidates.append((rest, np.concatenate([law[None], samples])))
         rest, values = min(candidates, key=lambda each: each[0])
         laws.append(values)

@@ -31,7 +31,7 @@ from forcegp.robot.model import RobotModel
 
 SAMPLES, FEWEST = 2000, 5
 """Maximum number of samples, and minimum number of samples of a joint in each direction of motion."""
-SLOWEST = 0.05
+REST_SHARE = 0.05
 """Speed, relative to the largest of a joint, below which it counts as at rest."""
 BANDS = {"slow friction": (0.0, 0.25), "fast friction": (0.75, 1.0)}
 """Quantiles of the speeds of a joint in motion between which friction is averaged."""
@@ -131,7 +131,7 @@ def _of_joints(
     for j, joint in enumerate(system.robot.joint_names):
         unit = "N m" if system.robot.joint_types[j] == "revolute" else "N"
         v, size = qd[:, j], qd[:, j].abs()
-        moves = size > SLOWEST * size.max()
+        moves = size > REST_SHARE * size.max()
         if not bool(system.robot.driven[j]) or not bool(moves.any()):
             continue
         # −Q = −Q_D − Φ w
