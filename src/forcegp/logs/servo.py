@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import scipy
+from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
 
 from forcegp.errors import DataError
@@ -190,8 +191,8 @@ class _Search:
 
     moved: _Motion
     asked: _Motion
-    rows: Array
-    joints: list[tuple[int, Array, Array]]
+    rows: NDArray[np.int64]
+    joints: list[tuple[int, NDArray[np.bool_], Array]]
 
     @classmethod
     def of(cls, signals: Signals, robot: RobotModel, mapping: Mapping) -> _Search:
@@ -261,7 +262,7 @@ class _Search:
         bounds = (max(0.0, best - 2.0 * STEP), best + 2.0 * STEP)
         return float(scipy.optimize.minimize_scalar(misfit, bounds=bounds, method="bounded").x)
 
-    def stiffness(self, delay: float, unknown: Array) -> Array:
+    def stiffness(self, delay: float, unknown: NDArray[np.bool_]) -> Array:
         """Return 1/θ₁ (nq,), the stiffness of each joint, and NaN where it is not unknown.
 
         Raises:
