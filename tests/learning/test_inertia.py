@@ -5,6 +5,8 @@ from __future__ import annotations
 import dataclasses
 import time
 import warnings
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -24,7 +26,7 @@ from forcegp.forces.quantities import states
 from forcegp.identification import regressor
 from forcegp.learning import inverse_dynamics
 from forcegp.learning.correlation import correlation_times
-from forcegp.learning.inertia import Inertia, inertia_of, latent_precision, one_row
+from forcegp.learning.inertia import Inertia, _Regression, inertia_of, latent_precision, one_row
 from forcegp.learning.inverse_dynamics import (
     APART,
     Rows,
@@ -579,3 +581,21 @@ def test_few_blocks_show_a_difference_by_chance_no_more_often_than_two_standard_
         noise = torch.randn(20_000, blocks, generator=generator, dtype=torch.float64)
         share = sum(is_less(each) for each in noise) / len(noise)
         assert share == pytest.approx(0.02275, abs=0.004)  # Φ(−2)
+
+
+def test_drives_need_evidence_with_links_unknown() -> None:
+    """Of five drives clear with links at the file: dropped where data are against it, or it is negative."""
+    V, W = torch.full((5,), 1e-4), torch.tensor([1e-2, 1e-2, 0.9, 1e-2, 1e-2])
+    v = torch.tensor([0.01, 0.5, 0.05, -0.5, 0.5])
+    clear = torch.tensor([0.2, 0.2, 0.2, 0.2, 0.02])
+    # log N(0; v, W) − log N(0; 0, 1), the ratio of Savage and Dickey
+    worth = torch.distributions.Normal(0.0, 1.0).log_prob(torch.zeros(5)) - torch.distributions.Normal(
+        v, W.sqrt()
+    ).log_prob(torch.zeros(5))
+    assert (worth < -np.log(3.0)).tolist() == [True, False, False, False, False]
+    answers = {5: (clear, V), 8: (v, W)}
+    fake: Any = SimpleNamespace(
+        by_stretch=SimpleNamespace(unknowns=9), read=lambda n, unknowns: answers[len(unknowns)]
+    )
+    kept = _Regression.carried_drives(fake, torch.zeros(5), torch.arange(0))
+    assert kept.tolist() == [1, 2]
