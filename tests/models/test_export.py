@@ -278,10 +278,7 @@ def log_of(fit: StructuredFit) -> forcegp.Dataset:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "first",
-    [pytest.param(0, marks=pytest.mark.xfail(reason="rounding of 1.7e-10 of σ (required: 1e-10)")), 2],
-)
+@pytest.mark.parametrize("first", [0, 2])
 def test_undetermined_forces_are_those_of_the_fit(first: int) -> None:
     fit, n = fitted("undetermined"), 16
     fast, state, active = compiled("undetermined"), draw(n, 11), mixed_contacts(n).repeat(1, 2)
