@@ -93,6 +93,9 @@ def test_the_speed_at_rest_lies_between_two_modes() -> None:
     assert both is not None and creeps.max() < both < slides.min()
     assert resting_speed(creeps) == 0.01, "a tip that never moves faster"
     # Turning round is no rest: speeds of a sine.
+    noise = np.hypot(*(4e-3 * np.random.default_rng(0).standard_normal((2, 5000))))
+    limit = resting_speed(noise)
+    assert limit is not None and 0.01 < limit < 0.02 and (noise < limit).mean() > 0.998, "noise at rest"
     assert resting_speed(np.abs(0.1 * np.sin(np.linspace(0.0, 50.0, 5000)))) is None
     assert dividing_speed(np.array([0.3, 0.1, 0.2, 0.4]), np.array([0, 1, 1, 0], bool)) == pytest.approx(0.25)
     assert dividing_speed(np.array([0.1, 0.2]), np.array([False, False])) is None

@@ -38,6 +38,9 @@ VALLEY, SHARE = 0.5, 0.1
 that pauses only when it reverses does not stick."""
 SLOWEST = 1e-6
 """Lower bound to which speeds are clamped [m/s]."""
+REST_MEDIANS = 3.4
+"""Ratio of the largest speed of a tip that always rests, whose apparent speed is noise, to its median: four
+standard deviations of each of two components."""
 
 
 def derive_joints(
@@ -170,7 +173,8 @@ def resting_speed(speed: Array) -> float | None:
         # Take the middle of the deepest bins, since an empty valley has several.
         deepest = np.flatnonzero(depth <= depth.min() + 1e-12)
         return float(10.0 ** (0.5 * (edges[deepest[0]] + edges[deepest[-1] + 1])))
-    return SLIDING if np.median(speed) < SLIDING else None
+    usual = float(np.median(speed))
+    return max(SLIDING, REST_MEDIANS * usual) if usual < SLIDING else None
 
 
 def dividing_speed(speed: Array, sticks: NDArray[np.bool_]) -> float | None:
