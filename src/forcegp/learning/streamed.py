@@ -184,10 +184,7 @@ def moving_rows(data: Dataset) -> Tensor:
 def _in_threads(
     work: Callable[[Dataset], Totals], pieces: Iterable[Dataset], threads: int
 ) -> Iterator[Totals]:
-    """Yield the results of pieces in their order, of which each is computed by one thread.
-
-    A million rows of a 7-joint arm take 54 instead of 69 s on two threads.
-    """
+    """Yield the results of pieces in their order, of which each is computed by one thread."""
     waiting: deque[Future[Totals]] = deque()
 
     def alone(piece: Dataset) -> Totals:
