@@ -8,15 +8,17 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 import torch
-from matplotlib.axes import Axes
 from numpy.typing import NDArray
 from torch import Tensor
 
 from forcegp.errors import ParameterError, check_name
+
+if TYPE_CHECKING:  # matplotlib loads for 0.3 s
+    from matplotlib.axes import Axes
 
 MEASURED = "#222222"
 PREDICTED = "#0072b2"
@@ -136,7 +138,7 @@ def as_array(values: Any) -> Array:
     return torch.as_tensor(values).detach().to("cpu", torch.float64).numpy()
 
 
-Target = Axes | Iterable[Axes] | None
+Target: TypeAlias = "Axes | Iterable[Axes] | None"
 """Axes to draw on, one per panel; `None` creates a new figure."""
 WIDTH, ROW, MARGIN = 7.0, 1.25, 0.9
 """Width, height per panel, and margin of a new figure [inch]."""
@@ -197,7 +199,7 @@ def _axes(count: int, ax: Target) -> list[Axes]:
         _, made = plt.subplots(count, 1, sharex=True, squeeze=False, figsize=size, layout="constrained")
         made[0, 0].figure.align_ylabels()
         return list(made[:, 0])
-    axes = [ax] if isinstance(ax, Axes) else list(np.asarray(ax, dtype=object).ravel())
+    axes = list(np.asarray(ax, dtype=object).ravel())
     if len(axes) != count:
         text = "the number of axes differs from the number of panels"
         hint = "pass ax=None for a new figure, or choose joints"

@@ -5,10 +5,12 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from forcegp.compiled.expression import UNARY, Graph, Scalar
+from forcegp.errors import ModelError
 
 
 def evaluate(x: Scalar, values: list[float]) -> float:
@@ -47,6 +49,14 @@ def test_equal_expressions_are_one_node() -> None:
     x, y = graph.input("q", 0), graph.input("q", 1)
     assert (x * y + x).position == (x + y * x).position
     assert (x - y).position != (y - x).position
+
+
+@pytest.mark.parametrize("exponent", [-2, 0, 1, 2, 3.0])
+def test_integer_powers_are_products(exponent: float) -> None:
+    x = Graph().input("q", 0)
+    assert evaluate(x**exponent, [1.7]) == pytest.approx(1.7**exponent, rel=1e-15)
+    with pytest.raises(ModelError, match="a power has no form"):
+        _ = x**0.5
 
 
 def test_only_live_nodes_are_listed() -> None:

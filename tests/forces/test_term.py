@@ -10,6 +10,8 @@ import torch
 from torch import Tensor
 
 import forcegp
+from forcegp.errors import ModelError
+from forcegp.forces.priors.joint import JointFrictionPrior
 from forcegp.forces.priors.memory import DISTANCES, BristlePrior, bristles
 from forcegp.forces.term import Array, JointState, JointTerm, exp
 from forcegp.forces.term import log as logarithm
@@ -43,7 +45,18 @@ class Creep(JointTerm):
     name: str = "creep"
 
     def columns(self, x: JointState) -> dict[str, Array]:
-        return {"creep": x.direction() * logarithm(1.0 + abs(x.qd) / 0.1), "drag": x.qd * abs(x.qd)}
+        return {"creep": x.direction() * logarithm(1.0 + abs(x.qd) / 0.1), "cubic": x.qd**3}
+
+
+@dataclass(frozen=True)
+class Clipped(JointTerm):
+    """Friction with a function that only PyTorch has."""
+
+    kernel: Kernel = field(default_factory=Columns)
+    name: str = "clipped"
+
+    def columns(self, x: JointState) -> dict[str, Array]:
+        return {"clipped": torch.clamp(x.qd, -1.0, 1.0)}  # type: ignore[arg-type]
 
 
 def force(qd: Tensor) -> Tensor:
@@ -88,13 +101,37 @@ def test_a_saved_law_keeps_its_parameters(fit, tmp_path: Path) -> None:
         assert isinstance(again, StructuredFit) and again.parameters() == fit.parameters()
 
 
-def test_laws_may_use_magnitudes_and_logarithms() -> None:
+def test_laws_may_use_magnitudes_powers_and_logarithms() -> None:
     """In C with Jacobians by automatic differentiation, and in PyTorch."""
     (system, data), (_, test) = log(0, 400), log(2, 20)
     fit = forcegp.StructuredGP(system, "analytical", [Creep()]).fit(data)
     one, two = fit.predict(test.q, test.qd, test.tau), fit.compiled().predict(test.q, test.qd, test.tau)
     torch.testing.assert_close(two.mean, one.mean, rtol=SAME, atol=SAME)
     torch.testing.assert_close(two.covariance, one.covariance, rtol=1e-7, atol=SAME)
+
+
+def test_a_law_without_a_form_in_c_is_named() -> None:
+    system, data = log(0, 300)
+    fit = forcegp.StructuredGP(system, "analytical", [Clipped()]).fit(data)
+    with pytest.raises(ModelError, match="'clipped' have no form in C and CasADi"):
+        fit.compiled()
+
+
+def test_a_law_with_the_name_of_another_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ModelError, match="'joint_friction' of .*Second is that of JointFrictionPrior"):
+
+        class Second(JointTerm):
+            name: str = "joint_friction"
+
+    @dataclass(frozen=True)
+    class Inherits(JointFrictionPrior):
+        """It has no name of its own, so that files keep that of its base."""
+
+    assert JointTerm.laws["joint_friction"] is JointFrictionPrior
+    system, data = log(0, 300)
+    fit = forcegp.StructuredGP(system, "analytical", [JointFrictionPrior()]).fit(data, learn=[])
+    fit.save(tmp_path / "model")
+    assert forcegp.load_model(tmp_path / "model").predict(data.q[0], data.qd[0], data.tau[0]).mean.shape == (2,)
 
 
 def test_compiled_code_and_casadi_read_the_same_lines(fit, tmp_path: Path) -> None:

@@ -19,11 +19,12 @@ from typer.testing import CliRunner
 import forcegp
 from forcegp import kinematics
 from forcegp.cli import app
+from forcegp.constraints import ImplicitSurface
 from forcegp.models.structured_fit import StructuredFit
 from forcegp.report.animation import animation_source, arm_points
 from forcegp.robot.shapes import shapes_of
 from forcegp.view.motion import Motion, at_rest, of_log, pictures, with_rollout
-from forcegp.view.page import ARROW, content_of, force_text, serve, write_view
+from forcegp.view.page import ARROW, TILES, _patches, content_of, force_text, serve, write_view
 from forces.cases import logged, two_contacts
 from robots import example_data
 
@@ -80,6 +81,18 @@ def test_an_arrow_is_as_long_as_the_force_and_its_bar_is_two_deviations() -> Non
     opened = int(np.flatnonzero(~np.isfinite(force.value))[0])
     assert arrow["tip"][opened] is None and content["texts"][opened][0] == "table: open"
     assert content["texts"][k][0] == force_text(force, k) != "table: open"
+
+
+def test_any_surface_is_drawn_where_it_is() -> None:
+    bowl = ImplicitSurface(lambda p: p[2] - 0.3 - 0.5 * (p[0] ** 2 + p[1] ** 2))
+    along = np.stack([np.linspace(-0.4, 0.4, 200), np.full(200, 0.1), np.full(200, 0.35)], axis=-1)
+    tiles = _patches(bowl, along)
+    centres = torch.from_numpy(np.stack([tile.mean(axis=0) for tile in tiles]))
+    assert len(tiles) == TILES and float(bowl.value(centres).abs().max()) < 1e-6
+    sides = np.stack([tile[1] - tile[0] for tile in tiles])
+    normals = bowl.gradient(centres).numpy()
+    across = np.cross(sides, normals)
+    np.testing.assert_allclose(np.linalg.norm(across, axis=-1), 0.0, atol=1e-9)
 
 
 def test_solids_move_with_their_links() -> None:

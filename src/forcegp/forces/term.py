@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
+from forcegp.errors import ModelError
 from forcegp.forces.priors.base import JOINT, ForcePrior
 from forcegp.forces.quantities import States
 from forcegp.robot.model import RobotModel
@@ -154,8 +155,15 @@ class JointTerm(PerJointPrior):
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
-        if isinstance(getattr(cls, "name", None), str):
-            JointTerm.laws[cls.name] = cls
+        name = cls.__dict__.get("name")
+        if not isinstance(name, str):
+            return
+        other = JointTerm.laws.get(name, cls)
+        # A notebook defines a class again when its cell runs again.
+        if (other.__module__, other.__qualname__) != (cls.__module__, cls.__qualname__):
+            text = f"the name {name!r} of {cls.__qualname__} is that of {other.__qualname__}"
+            raise ModelError(text, expected="a name that no other term has", hint="give the class its own name")
+        JointTerm.laws[name] = cls
 
     @abstractmethod
     def columns(self, x: JointState) -> dict[str, Array]:

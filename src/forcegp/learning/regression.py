@@ -140,14 +140,20 @@ def regression(
     rest = {key: value for key, value in start.items() if key not in remainder}
     named = without_inducing(part.without_priors(later))
 
-    def of_laws(named: Problem, start: Tensors) -> Scales:
-        return _alternating(named, start, learns, noisy, prunes, degrees_of_freedom, progress)
+    def of_laws(named: Problem, start: Tensors, found: str = "") -> Scales:
+        def is_learned(name: str) -> bool:
+            return name == found or learns(name)
+
+        return _alternating(named, start, is_learned, noisy, prunes, degrees_of_freedom, progress)
 
     scales = of_laws(named, rest)
     if prunes and noisy and (ripple := ripple_in(scales)) is not None:
         others = [prior.name for prior in named.priors]
         named = named.with_priors([ripple])
-        scales = of_laws(named, {**initial(named.without_priors(others), False), **rest})
+        rippled = of_laws(named, {**initial(named.without_priors(others), False), **rest}, ripple.name)
+        p = [prior.name for prior in rippled.problem.priors].index(ripple.name)
+        dropped = sum(prior == p for prior, _ in rippled.idle)
+        scales = rippled if dropped < named.system.robot.nq else scales
     if later:
         scales = with_remainder(part, scales, remainder, learns, noisy, prunes)
     values = {**scales.values, **memory_noise(scales)}
@@ -172,24 +178,28 @@ def _alternating(
     degrees_of_freedom: float | None,
     progress: FitProgress | None,
 ) -> Scales:
-    """Return scales and noise of laws, alternating with a search for Coulomb friction."""
+    """Return scales and noise of laws, alternating with a search for Coulomb friction.
+
+    The last pass drops columns.
+    """
     friction = [key for key in start if key.startswith(COULOMB + ".") and learns(COULOMB)]
     passes = PASSES if friction or degrees_of_freedom is not None else 1
-    scales = learned_scales(part, dict(start), learns, noisy, prunes)
+    start, begin, settled = dict(start), None, False
     for number in range(1, passes + 1):
+        last = settled or number == passes
+        scales = learned_scales(part, start, learns, noisy, prunes and last, begin)
         part, values = scales.problem, scales.values
         if progress is not None:
             progress(number, passes, math.nan)
-        if number == passes:
+        if last:
             break
         if degrees_of_freedom is not None:
             part = weighted(part, values, degrees_of_freedom)
         searched = _coulomb(part, values, friction) if friction else {}
-        settled = all(float((searched[key] - values[key]).abs().max()) < SETTLED for key in friction)
-        if settled and degrees_of_freedom is None:
-            break
+        changes = (float((searched[key] - values[key]).abs().max()) for key in friction)
+        settled = degrees_of_freedom is None and all(change < SETTLED for change in changes)
         # The scales start from the stated ones again.
-        scales = learned_scales(part, {**start, **searched}, learns, noisy, prunes, noise_of(values))
+        start, begin = {**start, **searched}, noise_of(values)
     return scales
 
 

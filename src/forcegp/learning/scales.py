@@ -53,6 +53,8 @@ STEPS, ACCURACY, DIVISIONS = 50, 1e-3, 16
 maximum number of times that a step is divided."""
 LEAST_VARIANCE = EXACT**2
 """Variance of torques that is stored in place of zero [N² m², N²]."""
+ROUNDING = 1e-14
+"""Added to the diagonal of covariances of rows, relative to it, above the rounding of a factorization."""
 AT_REST = (0.02, 0.05, 0.1)
 """Speeds v_s below which a joint or contact is nearly at rest, of which the likeliest is taken [rad/s, m/s]:
 the resolution of common encoders, and speeds at which joints reverse within a sampling period."""
@@ -233,9 +235,10 @@ class Residuals(NamedTuple):
         """Return Bᵀ C⁻¹ r `(n, nq + 3 c)` and Bᵀ C⁻¹ B for variances σ² and σ_s² `(nq + c,)`."""
         S = self.variances(torque, stick)
         C = (self.B * S[:, None]) @ self.B.mT + torch.eye(self.r.shape[-1]).to(S)
-        both = torch.linalg.solve(C, torch.cat([self.B, self.r[..., None]], dim=-1))
-        both = self.B.mT @ both
-        return both[..., -1], both[..., :-1]
+        L, _ = torch.linalg.cholesky_ex(C + ROUNDING * torch.diag_embed(C.diagonal(dim1=-2, dim2=-1)))
+        white = torch.linalg.solve_triangular(L, torch.cat([self.B, self.r[..., None]], -1), upper=False)
+        B, r = white[..., :-1], white[..., -1:]
+        return (B.mT @ r)[..., 0], B.mT @ B
 
 
 def without_components(scales: Scales, priors: Sequence[int], kept: Sequence[bool], noisy: bool) -> Scales:

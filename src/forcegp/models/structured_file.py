@@ -69,7 +69,7 @@ CLASSES: dict[str, type] = {
 
 def classes() -> dict[str, type]:
     """Return the classes that can be saved, by their names in the file."""
-    return {**CLASSES, **JointTerm.laws}
+    return {**JointTerm.laws, **CLASSES}
 
 
 COLUMNS = ("q", "qd", "tau", "active", "values")

@@ -31,6 +31,8 @@ ARROW = 0.3
 """Length of the longest arrow [m]."""
 MARGIN = 0.15
 """Distance by which a drawn surface extends beyond the path of the tip [m]."""
+TILE, TILES, PROJECTIONS = 0.04, 60, 3
+"""Side [m] and number of the tiles that show a surface without a simple shape, and Newton steps onto it."""
 LOCAL, PORT = "127.0.0.1", 8080
 """Address of the server, which is accessible only from this computer."""
 
@@ -46,7 +48,7 @@ def content_of(motion: Motion, shapes: Sequence[Shape]) -> dict[str, Any]:
     for contact in system.contacts:
         if isinstance(contact, SurfaceContact):
             around = _around(motion, contact.name, arm[:, -1].detach().cpu().numpy())
-            solids.append(solid(_patch(contact.surface, around), SURFACE, None))
+            solids += (solid(part, SURFACE, None) for part in _patches(contact.surface, around))
     largest = max((float(np.nanmax(abs(f.value), initial=0.0)) for f in motion.forces), default=0.0)
     return {
         "times": motion.t.tolist(),
@@ -77,24 +79,32 @@ def _around(motion: Motion, contact: str, tip: Array) -> Array:
     return points if len(points) else tip
 
 
-def _patch(surface: Surface, points: Array) -> Array:
-    """Return the corners of a planar patch below the points, a sphere, or a cylinder along the points."""
+def _patches(surface: Surface, points: Array) -> list[Array]:
+    """Return the corners of a planar patch below the points, a sphere, a cylinder along the points, or tiles
+    on another surface near the points."""
     if isinstance(surface, Plane):
         R = turn_z(np.asarray(surface.normal))
         local = points @ R
         low, high = local.min(axis=0) - MARGIN, local.max(axis=0) + MARGIN
         middle = 0.5 * (low + high)
         middle[2] = surface.offset - 0.005
-        return (box(high[0] - low[0], high[1] - low[1], 0.01) + middle) @ R.T
+        return [(box(high[0] - low[0], high[1] - low[1], 0.01) + middle) @ R.T]
     if isinstance(surface, Sphere):
-        return sphere(surface.radius) + np.asarray(surface.center)
+        return [sphere(surface.radius) + np.asarray(surface.center)]
     if isinstance(surface, Cylinder):
         axis, centre = np.asarray(surface.axis), np.asarray(surface.center)
         along = (points - centre) @ axis
         length = float(along.max() - along.min()) + 2.0 * MARGIN
         middle = centre + 0.5 * float(along.max() + along.min()) * axis
-        return cylinder(surface.radius, length, 48) @ turn_z(axis).T + middle
-    return np.zeros((0, 3))
+        return [cylinder(surface.radius, length, 48) @ turn_z(axis).T + middle]
+    p = torch.from_numpy(points[np.linspace(0, len(points) - 1, TILES).astype(int)])
+    for _ in range(PROJECTIONS):
+        # p − c ∇c/|∇c|²
+        slope = surface.gradient(p)
+        p = p - surface.value(p)[:, None] * slope / slope.square().sum(-1, keepdim=True)
+    normals = torch.nn.functional.normalize(surface.gradient(p), dim=-1).numpy()
+    tile = box(TILE, TILE, 0.1 * TILE)
+    return [tile @ turn_z(n).T + at for n, at in zip(normals, p.numpy(), strict=True)]
 
 
 def _arrow(force: Force, scale: float) -> dict[str, Any]:

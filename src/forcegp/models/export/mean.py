@@ -33,6 +33,7 @@ from forcegp.compiled.program import (
 )
 from forcegp.constraints import Cylinder, Plane, Sphere, SurfaceContact
 from forcegp.constraints.gauss import FACING_DOWN
+from forcegp.errors import ModelError
 from forcegp.forces.external_wrench import ROWS, WrenchFrame
 from forcegp.forces.priors import contact
 from forcegp.forces.priors.base import ForcePrior
@@ -236,7 +237,12 @@ class Mean:
         if isinstance(prior, JointTerm):
             load = np.array([(x.step() * 2.0 - 1.0) * x for x in self.Q_G], dtype=object)
             direction = None if slip is None else np.array(slip, dtype=object)
-            columns = prior.columns(JointState(self.q, self.qd, load, direction))
+            try:
+                columns = prior.columns(JointState(self.q, self.qd, load, direction))
+            except (AttributeError, TypeError) as cause:
+                text = f"the columns of {prior.name!r} have no form in C and CasADi: {cause}"
+                expected = "arithmetic, abs, integer powers and the functions of forcegp.forces.term"
+                raise ModelError(text, expected=expected) from cause
             return {name: list(column) for name, column in columns.items()}
         if isinstance(prior, contact.SurfaceForcePrior):
             at = self.touching[self.names.index(prior.contact)]
