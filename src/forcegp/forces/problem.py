@@ -23,6 +23,7 @@ from forcegp.forces.posterior import ForcePosterior, ForceProcess, hidden_varian
 from forcegp.forces.priors.base import ANALYTICAL, NOISE, RESERVED, ForceMean, ForcePrior
 from forcegp.forces.priors.contact import CoulombErrorPrior, CoulombFriction, coulomb_of
 from forcegp.forces.projection import WhitenedRows, combine, whiten
+from forcegp.forces.term import ExpectedForce
 from forcegp.forces.unknowns import tip_factor
 from forcegp.gp.basis import LatentBasis, latent_basis
 from forcegp.gp.exact import ExactPosterior, require_exact_fits
@@ -150,8 +151,8 @@ class Problem:
 
         The result is used for conditioning, but not for learning.
         """
-        friction = self.coulomb(tensors)
-        priors = tuple(CoulombErrorPrior(f.contact, friction) for f in friction)
+        friction, expected = self.coulomb(tensors), ExpectedForce.of(self.priors, tensors)
+        priors = tuple(CoulombErrorPrior(f.contact, friction, expected) for f in friction)
         one = self.system.robot.mass.new_zeros(1, 1)
         more, scale = len(priors), Standardization.none({"one": one})
         known = len(self.priors) - len(self.errors)

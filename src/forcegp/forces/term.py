@@ -9,7 +9,7 @@ weights w are Gaussian, and their standard deviations follow from the evidence (
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -178,3 +178,38 @@ class JointTerm(PerJointPrior):
         q, qd, load = robot.drive_motion(at.q), robot.drive_motion(at.qd), robot.drive_torque(at.eom.Q_G)
         x = JointState(q, qd, load.abs(), at.slip, history, at.recording)
         return {name: column[..., None] for name, column in self.columns(x).items()}
+
+
+EXPECTED, ONE = "expected", "one"
+"""Prefix of the names of the weights ŵ of an `ExpectedForce`, and the name of a constant column."""
+
+
+@dataclass(frozen=True, eq=False)
+class ExpectedForce:
+    """The force that learned terms are expected to have, Q̂ = Σ E Φ ŵ.
+
+    Attributes:
+        terms: terms of the joints, each with the weights ŵ `(nq,)` of its columns.
+    """
+
+    terms: tuple[tuple[JointTerm, Mapping[str, Tensor]], ...]
+
+    @classmethod
+    def of(cls, priors: Sequence[ForcePrior], tensors: Mapping[str, Tensor]) -> ExpectedForce:
+        """Return the force of the terms among priors whose weights are among learned tensors."""
+        found = []
+        for prior in priors:
+            start = f"{EXPECTED}.{prior.name}."
+            weights = {key.removeprefix(start): w for key, w in tensors.items() if key.startswith(start)}
+            if isinstance(prior, JointTerm) and weights:
+                found.append((prior, weights))
+        return cls(tuple(found))
+
+    def __call__(self, system: ConstrainedSystem, at: States) -> Tensor:
+        """Return Q̂ `(n, nq)` at given states."""
+        force = torch.zeros_like(at.q)
+        for term, weights in self.terms:
+            phi = {**term.features(system, at), ONE: torch.ones_like(at.q)[..., None]}
+            f = torch.stack([phi[name][..., 0] * w for name, w in weights.items()]).sum(0)
+            force = force + (term.operator(system, at) @ f[..., None])[..., 0]
+        return force

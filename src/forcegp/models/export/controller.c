@@ -45,6 +45,7 @@ typedef struct {
   int closed[SOME(CONTACTS)];
   touching contact[SOME(CONTACTS)];
   double x[SOME(INPUTS)], phi[SOME(FEATURES)]; /* standardized inputs and features of the priors */
+  double expected[NQ];                         /* force that learned terms are expected to have */
 } equations;
 
 /* the lower Cholesky factor G of M = G G^T `(n, n)`, and K = G^-1; returns 0 unless M is positive definite */
@@ -133,7 +134,8 @@ static int assemble(const double *restrict q, const double *restrict qd, const d
   memcpy(e->Q_D, out + NQ * NQ + 2 * NQ, sizeof e->Q_D);
   memcpy(e->contact, next, sizeof(touching) * CONTACTS), next += sizeof(touching) / sizeof(double) * CONTACTS;
   memcpy(e->x, next, sizeof(double) * INPUTS), next += INPUTS;
-  memcpy(e->phi, next, sizeof(double) * FEATURES);
+  memcpy(e->phi, next, sizeof(double) * FEATURES), next += FEATURES;
+  memcpy(e->expected, next, sizeof e->expected);
   for (int i = 0; i < NQ; ++i) Q[i] = e->Q_C[i] + e->Q_G[i] + e->Q_D[i] + TORQUE_SCALE[i] * tau[i];
   if (!inverse_factor(&e->M[0][0], NQ, G, K)) return 0;
   for (int i = 0; i < NQ; ++i)
@@ -398,15 +400,17 @@ static int against(const equations *restrict e, const double *restrict qd, int c
   return !loaded || relief > 0.0;
 }
 
-/* E = d(mu u)/d(log mu, log eps) lambda, with the multiplier under the analytical forces and this friction */
+/* E = d(mu u)/d(log mu, log eps) lambda, with the multiplier under known and expected forces and this friction */
 static void friction_error(const equations *restrict e, const double *restrict tau, const double *restrict gain, int c,
                            double mu, double smoothing, double (*restrict E)[NQ]) {
   const touching *at = &e->contact[c];
   const double square = dot(at->sliding, at->sliding, 3), fading = smoothing * smoothing / (square + smoothing * smoothing);
-  double u[NQ], Q[NQ], qdd[NQ], multiplier[SOME(ROWS)];
+  double u[NQ], Q[NQ], qdd[NQ], load[SOME(ROWS)], multiplier[SOME(ROWS)];
   against_sliding(at, smoothing, u);
   for (int j = 0; j < NQ; ++j)
-    Q[j] = e->Q_C[j] + e->Q_G[j] + e->Q_D[j] + TORQUE_SCALE[j] * tau[j] + dot(gain + j * ROWS, e->load, ROWS);
+    Q[j] = e->Q_C[j] + e->Q_G[j] + e->Q_D[j] + TORQUE_SCALE[j] * tau[j] + e->expected[j];
+  motion_under(e, Q, qdd, load);
+  for (int j = 0; j < NQ; ++j) Q[j] += dot(gain + j * ROWS, load, ROWS);
   motion_under(e, Q, qdd, multiplier);
   for (int j = 0; j < NQ; ++j) {
     E[0][j] = e->closed[c] ? mu * multiplier[c] * u[j] : 0.0;

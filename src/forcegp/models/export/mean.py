@@ -40,7 +40,7 @@ from forcegp.forces.priors.base import ForcePrior
 from forcegp.forces.priors.constants import DrivePrior
 from forcegp.forces.priors.inertial import MASS_AND_MOMENT, InertialPrior, PayloadPrior
 from forcegp.forces.priors.joint import TERMS, JointForcePrior
-from forcegp.forces.term import JointState, JointTerm
+from forcegp.forces.term import ONE, JointState, JointTerm
 from forcegp.gp import kernels
 from forcegp.gp.basis import KernelPart
 from forcegp.gp.features import stacked
@@ -96,6 +96,7 @@ class Mean:
         A, b: constraint rows of the contacts, which are zero for open contacts.
         x: standardized inputs of each prior, `(1 or components, width)`.
         phi: features of each component of each prior.
+        expected: the force that learned terms are expected to have, on which friction of contacts depends.
     """
 
     def __init__(self, model: ExportedModel, parts: Sequence[Functions]) -> None:
@@ -116,6 +117,7 @@ class Mean:
         self.b = np.array([at.b[0] for at in self.touching], dtype=object) * self.closed
         self.x = [self._inputs(p, None) for p in range(len(parts))]
         self.phi = [self._all_features(p, x) for p, x in enumerate(self.x)]
+        self.expected = self._expected()
 
     def program(self, outputs: Iterable[Scalar], arguments: Sequence[str]) -> Program:
         """Return a program with the given outputs and arguments."""
@@ -151,6 +153,17 @@ class Mean:
             [] if part.finite is None else self._features(p, part.finite, k, x[k if len(x) > 1 else 0])
             for k in range(part.components)
         ]
+
+    def _expected(self) -> Scalars:
+        """Return Q̂ of an `ExpectedForce`."""
+        force, errors = self.zeros(self.robot.nq), (part.prior for part in self.parts)
+        error = next((prior for prior in errors if isinstance(prior, contact.CoulombErrorPrior)), None)
+        for term, weights in () if error is None else error.expected.terms:
+            raw = {**self._raw_inputs(term, None), ONE: self.zeros(self.robot.nq) + 1.0}
+            for name, w in weights.items():
+                driven = w * self.robot.driven if term.needs_drive else w
+                force = force + np.array(raw[name], dtype=object) * np.array(driven.tolist())
+        return force
 
     def _damping(self, slip: Sequence[Scalar] | None) -> Scalars:
         """Return viscous, Coulomb and Stribeck friction from the robot file; `slip` replaces tanh(q̇/v₀)."""
@@ -467,7 +480,8 @@ class LearnedMotion(Mean):
         if isinstance(prior, contact.CoulombErrorPrior):
             law = next(x for x in prior.friction if x.contact == prior.contact)
             eps = float(law.smoothing)
-            load = self._motion(self.Q_D + self.tau, TERMS, self.U).multiplier[c] * float(law.coefficient)
+            known = self.Q_D + self.tau + self.expected
+            load = self._motion(known, TERMS, self.U).multiplier[c] * float(law.coefficient)
             E = self._against(c, eps) * (load * closed)
             return np.stack([E, E * (-(eps**2) / (square + eps**2))], axis=1)
         if not isinstance(prior, contact.SlidingFrictionPrior):

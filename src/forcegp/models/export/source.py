@@ -144,7 +144,7 @@ def _programs(mean: LearnedMotion, rollout: bool) -> list[str]:
     robot = mean.robot
     blocks = [mean.M, mean.Q_C, mean.Q_G, mean.Q_D, *(x for at in mean.touching for x in at), *mean.x]
     outputs = [x for block in blocks for x in block.flat]
-    outputs += [x for features in mean.phi for phi in features for x in phi]
+    outputs += [*(x for features in mean.phi for phi in features for x in phi), *mean.expected]
     programs = {"mechanics": mean.program(outputs, ARGUMENTS[:3])}
     programs["forward_dynamics"] = trace(robot, "forward_dynamics")
     if any(isinstance(part.prior, InertialPrior | PayloadPrior) for part in mean.parts):
