@@ -26,6 +26,7 @@ from forcegp.forces.priors.contact import (
 from forcegp.forces.priors.joint import JointFrictionPrior
 from forcegp.forces.problem import force_posterior, kernel_parameters
 from forcegp.forces.quantities import States, affine_map, states
+from forcegp.forces.term import ExpectedForce
 from forcegp.gp.kernels import Linear
 from forces.cases import CONTACTS, draw, logged, mixed_contacts, sampled_forces, two_contacts
 from random_data import table_system
@@ -212,11 +213,19 @@ def unit_friction_of_table(at: States, i: int) -> np.ndarray:
     return -J.T @ v / np.linalg.norm(v)
 
 
-def test_the_error_of_learned_friction_acts_as_its_derivative() -> None:
+@pytest.mark.parametrize("learned", [False, True])
+def test_the_error_of_learned_friction_acts_as_its_derivative(learned: bool) -> None:
+    """Also if terms of the joints are expected to have a force, here viscous friction and an offset."""
     at, system, names = at_states(), two_contacts(), list(CONTACTS)
-    laws = friction()
+    laws, known = friction(), at.eom.Q_K + at.tau
+    d, offset = torch.linspace(-3.0, -1.0, 7).double(), torch.linspace(2.0, -2.0, 7).double()
+    expected = ExpectedForce(())
+    if learned:
+        weights = {"expected.joint_friction.velocity": d, "expected.joint_friction.one": offset}
+        expected = ExpectedForce.of([JointFrictionPrior()], weights)
+        known = known + d * at.qd + offset
     for k, contact in enumerate(names):
-        E = CoulombErrorPrior(contact, tuple(laws)).operator(system, at)
+        E = CoulombErrorPrior(contact, tuple(laws), expected).operator(system, at)
         z = coupled(system, at, affine_map(system, at, "multiplier"), laws)
         found = z.B_z @ E
         for j, key in enumerate(("coefficient", "smoothing")):
@@ -225,7 +234,7 @@ def test_the_error_of_learned_friction_acts_as_its_derivative() -> None:
                 moved = list(laws)
                 value = getattr(laws[k], key) * math.exp(sign * 1e-5)
                 moved[k] = dataclasses.replace(laws[k], **{key: value})
-                ends.append(at.eom.multiplier(with_coulomb(system, at, at.eom.Q_K + at.tau, moved)))
+                ends.append(at.eom.multiplier(with_coulomb(system, at, known, moved)))
             difference = (ends[0] - ends[1]) / 2e-5
             torch.testing.assert_close(found[..., j], difference, rtol=1e-4, atol=1e-4)
 

@@ -55,6 +55,8 @@ def test_the_normal_force_is_found_without_a_force_sensor() -> None:
         assert abs(float(errors[-1].mean())) < 0.4 and float(errors[-1].std()) < 1.0
         coefficient = float(fit.hyperparameters[coulomb_keys("table")[0]].exp())
         assert coefficient == pytest.approx(scene.simulation.solver.friction, rel=0.05)
+        (mu,) = (x for x in fit.robot_parameters() if x.name == "friction coefficient")
+        assert abs(mu.value - scene.simulation.solver.friction) < 3.0 * mu.std
         scored = evaluate(fit, test, compare=False).multipliers[0]
         assert scored.coverage == pytest.approx(float(inside[-1].mean()))
     assert float(torch.corrcoef(torch.stack([torch.cat(read), torch.cat(truth)]))[0, 1]) > 0.95
