@@ -162,7 +162,8 @@ class JointTerm(PerJointPrior):
         # A notebook defines a class again when its cell runs again.
         if (other.__module__, other.__qualname__) != (cls.__module__, cls.__qualname__):
             text = f"the name {name!r} of {cls.__qualname__} is that of {other.__qualname__}"
-            raise ModelError(text, expected="a name that no other term has", hint="give the class its own name")
+            hint = "give the class its own name"
+            raise ModelError(text, expected="a name that no other term has", hint=hint)
         JointTerm.laws[name] = cls
 
     @abstractmethod
@@ -192,7 +193,7 @@ class ExpectedForce:
         terms: terms of the joints, each with the weights ŵ `(nq,)` of its columns.
     """
 
-    terms: tuple[tuple[JointTerm, Mapping[str, Tensor]], ...]
+    terms: tuple[tuple[JointTerm, Mapping[str, Tensor]], ...] = ()
 
     @classmethod
     def of(cls, priors: Sequence[ForcePrior], tensors: Mapping[str, Tensor]) -> ExpectedForce:

@@ -180,11 +180,13 @@ def _alternating(
     degrees_of_freedom: float | None,
     progress: FitProgress | None,
 ) -> Scales:
-    """Return scales and noise of laws, alternating with a search for Coulomb friction, and then drop columns."""
+    """Return scales and noise of laws after alternating with a search for Coulomb friction, without columns
+    that the evidence does not carry."""
     friction = [key for key in start if key.startswith(COULOMB + ".") and learns(COULOMB)]
     passes = PASSES if friction or degrees_of_freedom is not None else 1
-    start, begin = dict(start), None
-    for number in range(1, passes + 1):
+    start, begin, number = dict(start), None, 0
+    while True:
+        number += 1
         scales = learned_scales(part, start, learns, noisy, begin)
         part, values = scales.problem, scales.values
         if progress is not None:
@@ -297,7 +299,7 @@ def memory_noise(scales: Scales) -> Tensors:
 
 
 def expected_forces(scales: Scales) -> Tensors:
-    """Return the weights of an `ExpectedForce` in units of the columns, if friction of contacts depends on it.
+    """Return the weights of an `ExpectedForce` in units of the columns, if contact friction depends on it.
 
     The basis functions are the columns times a constant for each joint, V = φ g.
     """

@@ -365,7 +365,7 @@ class CoulombErrorPrior(ConstantForcePrior):
 
     contact: str
     friction: tuple[CoulombFriction, ...]
-    expected: ExpectedForce = ExpectedForce(())
+    expected: ExpectedForce = field(default_factory=ExpectedForce)
     kernel: Kernel = field(default_factory=lambda: Constant(group=LEARNED))
     target: str = CONTACT
 
