@@ -18,8 +18,6 @@ Node = tuple[str, object, object]
 """Operation and operands: ("const", value, None), ("input", name, index), or (op, left, right) positions."""
 UNARY = ("exp", "log", "tanh", "sqrt", "sin", "cos", "step")
 """Functions of one operand. `step` is 1 for positive operands and 0 otherwise."""
-LARGEST_EXPONENT = 8
-"""Largest exponent of a power, which is a product."""
 Tangents = dict[int, "Scalar"]
 """Derivatives of a scalar, keyed by direction. Missing derivatives are zero."""
 
@@ -211,11 +209,10 @@ class Scalar:
         return a if a.value == 0.0 else a._node("/", b)
 
     def __pow__(self, exponent: float) -> Scalar:
-        """Return a power with an integer exponent, as products."""
-        if not float(exponent).is_integer() or abs(exponent) > LARGEST_EXPONENT:
-            text = "a power has no form in C and CasADi"
-            expected = f"an integer exponent of at most {LARGEST_EXPONENT}"
-            raise ModelError(text, expected=expected, got=exponent, hint="use products, or exp and log")
+        """Return a power with an integer exponent, as a product."""
+        if not float(exponent).is_integer():
+            text, hint = "a power has no form in C and CasADi", "use products, or exp and log"
+            raise ModelError(text, expected="an integer exponent", got=exponent, hint=hint)
         whole = math.prod([self] * abs(int(exponent)), start=self.graph.constant(1.0))
         return whole if exponent >= 0 else 1.0 / whole
 

@@ -201,7 +201,8 @@ class ExpectedForce:
         found = []
         for prior in priors:
             start = f"{EXPECTED}.{prior.name}."
-            weights = {key.removeprefix(start): w for key, w in tensors.items() if key.startswith(start)}
+            keys = sorted(key for key in tensors if key.startswith(start))
+            weights = {key.removeprefix(start): tensors[key] for key in keys}
             if isinstance(prior, JointTerm) and weights:
                 found.append((prior, weights))
         return cls(tuple(found))

@@ -142,18 +142,16 @@ def regression(
     rest = {key: value for key, value in start.items() if key not in remainder}
     named = without_inducing(part.without_priors(later))
 
-    def of_laws(named: Problem, start: Tensors, found: str = "") -> Scales:
-        def is_learned(name: str) -> bool:
-            return name == found or learns(name)
+    def of_laws(named: Problem, start: Tensors, learns: Callable[[str], bool]) -> Scales:
+        return _alternating(named, start, learns, noisy, prunes, degrees_of_freedom, progress)
 
-        return _alternating(named, start, is_learned, noisy, prunes, degrees_of_freedom, progress)
-
-    scales = of_laws(named, rest)
+    scales = of_laws(named, rest, learns)
     if prunes and noisy and (ripple := ripple_in(scales)) is not None:
-        others = [prior.name for prior in named.priors]
+        others, name = [prior.name for prior in named.priors], ripple.name
         named = named.with_priors([ripple])
-        rippled = of_laws(named, {**initial(named.without_priors(others), False), **rest}, ripple.name)
-        p = [prior.name for prior in rippled.problem.priors].index(ripple.name)
+        begin = {**initial(named.without_priors(others), False), **rest}
+        rippled = of_laws(named, begin, lambda each: each == name or learns(each))
+        p = [prior.name for prior in rippled.problem.priors].index(name)
         dropped = sum(prior == p for prior, _ in rippled.idle)
         scales = rippled if dropped < named.system.robot.nq else scales
     if later:
@@ -307,19 +305,18 @@ def expected_forces(scales: Scales) -> Tensors:
     if not problem.has_coulomb:
         return found
     process, system = problem.process_at(scales.values), problem.system
+    at = problem.training.measurements[0].at(system)
     for p, prior in enumerate(problem.priors):
         if not isinstance(prior, JointTerm) or not isinstance(prior.kernel, Linear) or prior.is_error:
             continue
         w = scales.evidence.weights[basis.of_process(p)].view(system.robot.nq, -1)
-        for m in problem.training.measurements[:1]:
-            at = m.at(system)
-            V = basis.parts[p].values(process.features(p, system, at))[0]
-            columns = {**prior.features(system, at), ONE: torch.ones_like(at.q)[..., None]}
-            # The last basis function of a kernel with a constant
-            for c, (name, phi) in zip(range(V.shape[-1]), columns.items(), strict=False):
-                x = phi[..., 0].mT
-                g = (V[..., c] * x).sum(1) / x.square().sum(1).clamp(min=1e-300)
-                found[f"{EXPECTED}.{prior.name}.{name}"] = g * w[:, c]
+        V = basis.parts[p].values(process.features(p, system, at))[0]
+        # A constant, if the kernel has one, is the last basis function.
+        columns = {**prior.features(system, at), ONE: torch.ones_like(at.q)[..., None]}
+        for c, (name, phi) in zip(range(V.shape[-1]), columns.items(), strict=False):
+            x = phi[..., 0].mT
+            g = (V[..., c] * x).sum(1) / x.square().sum(1).clamp(min=1e-300)
+            found[f"{EXPECTED}.{prior.name}.{name}"] = g * w[:, c]
     return found
 
 

@@ -27,6 +27,7 @@ import scipy.optimize
 import torch
 from torch import Tensor
 
+from forcegp.errors import NumericalError
 from forcegp.forces.noise import EXACT, TORQUE_NOISE
 from forcegp.forces.posterior import STICK_NOISE, STICK_SPEED, hidden_variance
 from forcegp.forces.priors.base import NOISE
@@ -53,8 +54,9 @@ STEPS, ACCURACY, DIVISIONS = 50, 1e-3, 16
 maximum number of times that a step is divided."""
 LEAST_VARIANCE = EXACT**2
 """Variance of torques that is stored in place of zero [N² m², N²]."""
-ROUNDING = 1e-14
-"""Added to the diagonal of covariances of rows, relative to it, above the rounding of a factorization."""
+ROUNDING = 32.0
+"""Added to the diagonal of covariances of rows, relative to it, in units of the machine epsilon ε: above the
+rounding of a factorization of 18 joints, about 18 ε."""
 AT_REST = (0.02, 0.05, 0.1)
 """Speeds v_s below which a joint or contact is nearly at rest, of which the likeliest is taken [rad/s, m/s]:
 the resolution of common encoders, and speeds at which joints reverse within a sampling period."""
@@ -235,10 +237,17 @@ class Residuals(NamedTuple):
         return whole[:, : self.external.shape[-1]]
 
     def read(self, torque: Tensor, stick: Tensor) -> tuple[Tensor, Tensor]:
-        """Return Bᵀ C⁻¹ r `(n, nq + 3 c)` and Bᵀ C⁻¹ B for variances σ² and σ_s² `(nq + c,)`."""
+        """Return Bᵀ C⁻¹ r `(n, nq + 3 c)` and Bᵀ C⁻¹ B for variances σ² and σ_s² `(nq + c,)`.
+
+        Raises:
+            NumericalError: C is not finite, or not positive definite.
+        """
         S = self.variances(torque, stick)
         C = (self.B * S[:, None]) @ self.B.mT + torch.eye(self.r.shape[-1]).to(S)
-        L, _ = torch.linalg.cholesky_ex(C + ROUNDING * torch.diag_embed(C.diagonal(dim1=-2, dim2=-1)))
+        rounding = ROUNDING * torch.finfo(C.dtype).eps * C.diagonal(dim1=-2, dim2=-1)
+        L, failed = torch.linalg.cholesky_ex(C + torch.diag_embed(rounding))
+        if bool(failed.any()):
+            raise NumericalError("the covariance of rows is not finite, or not positive definite")
         white = torch.linalg.solve_triangular(L, torch.cat([self.B, self.r[..., None]], -1), upper=False)
         B, r = white[..., :-1], white[..., -1:]
         return (B.mT @ r)[..., 0], B.mT @ B

@@ -351,9 +351,9 @@ def _coupled_priors(priors: Iterable[ForcePrior]) -> list[SlidingFrictionPrior]:
 class CoulombErrorPrior(ConstantForcePrior):
     """A prior on the error of learned friction, Q_z = λ̂ ∂(μ u)/∂(log μ, log ε) δ with δ ~ N(0, 1).
 
-    λ̂ is the multiplier under the analytical forces, the forces that learned terms of the joints are expected
-    to have, and the learned friction. Without the expected forces, errors of λ̂ would be mistaken for changes
-    of the load: in six simulated logs with μ = .3, the largest error of μ is then 5.6 σ, and otherwise 2.4 σ.
+    λ̂ is the multiplier under the analytical forces, the expected forces of learned terms of the joints, and
+    the learned friction. Without the expected forces, joint friction that the robot file lacks would be
+    mistaken for a changing load: in six simulated logs, the largest error of μ would be 5.6 σ, not 2.4 σ.
     The unit standard deviation of δ is about the width of the weak priors on log μ and log ε
     (`learning/search.py`).
 
