@@ -52,6 +52,9 @@ ALTERNATIONS, SETTLED, NEGLIGIBLE = 20, 0.02, 1e-3
 STEPS, ACCURACY, DIVISIONS = 50, 1e-3, 16
 """Maximum number of steps of Fisher scoring in one alternation, relative change at which they end, and
 maximum number of times that a step is divided."""
+RELAXATION = (0.1, 3.0)
+"""Least and largest relaxation of steps. Without relaxation, a biped with eight contacts takes 3155 steps in place
+of 320 (57 of 84 alternations end at `STEPS`), and `ur5_wiping` 263 in place of 202."""
 LEAST_VARIANCE = EXACT**2
 """Variance of torques that is stored in place of zero [N² m², N²]."""
 ROUNDING = 32.0
@@ -403,15 +406,23 @@ def _settled(rows: Residuals, theta: Tensor, share: Tensor, free: Tensor) -> Ten
     """Return the variances θ after scoring until they no longer change.
 
     If the rows contain little information on a variance, a step can be far too long. A long step is divided
-    by four until it does not lower the density.
+    by four until it does not lower the density. Short steps s are relaxed by Aitken's Δ² method (Irons and
+    Tuck 1969), ω ← −ω sₖ₋₁ᵀ(sₖ − sₖ₋₁) / |sₖ − sₖ₋₁|², since they overshoot if residuals are not Gaussian.
     """
     nq, count = rows.external.shape[-1], rows.slow.shape[-1]
     joints = (torch.arange(count) < nq).repeat(2).to(theta.device)
+    last, relaxation = None, 1.0
     for _ in range(STEPS if bool(free.any()) else 0):
         step = torch.where(free, _scored(rows, theta, share, free) - theta, 0.0)
-        if bool((step.abs() > 0.5 * theta).any()):
-            step = _shortened(rows, theta, step)
         size = torch.where(joints, theta[joints].max(), theta).clamp(min=LEAST_VARIANCE)
+        if bool((step.abs() > 0.5 * size).any()):
+            step, last, relaxation = _shortened(rows, theta, step), None, 1.0
+        else:
+            if last is not None:
+                change = (step - last) / size
+                ratio = -float((last / size) @ change / change.square().sum().clamp(min=1e-300))
+                relaxation = min(max(ratio * relaxation, RELAXATION[0]), RELAXATION[1])
+            last, step = step, (theta + relaxation * step).clamp(min=0.0) - theta
         theta = theta + step
         if float((step.abs() / size).max()) < ACCURACY:
             break
