@@ -1,13 +1,14 @@
 """Feet of legged robots that MuJoCo moves: forces along the log, learned on one gait and tested on another.
 
-    python benchmarks/legs.py --json legs.json            # two robots, three frictions, two seeds
+    python benchmarks/legs.py --json legs.json            # three robots, three frictions, two seeds
     python benchmarks/legs.py --robot solo12 --friction coulomb --seeds 0
     python benchmarks/legs.py --case touchdown         # labels of closed feet from an imported log
 
 The true robot has joint friction, a payload of a tenth of its mass on the trunk, and links that differ from
 the file by 5 %. Torques, encoders and the IMU are noisy. Training logs hold standing, swaying and a trot;
-the test is a walk. The force of each foot along the log is compared with the engine's, as are pushes on the
-trunk while swaying.
+the test is a walk. A biped with flat feet of four balls each, waist and arms locked, steps in place and then
+walks. The force of each foot along the log is compared with the engine's, as are pushes on the trunk while
+swaying.
 
 - `legs`: −J⁻ᵀτ of each leg by itself, with gravity and motion of the leg's links ignored.
 - `equations of motion`: M q̈ − Q_K − τ = Σ JᵀF with the file, by generalized least squares.
@@ -77,6 +78,8 @@ DRIFT = {"position": 3e-3, "velocity": 0.01, "correlation": 0.1, "leak": 2.0, "t
 the position forgets after some seconds, and of the orientation [rad]. The position is off by 5 mm RMS."""
 FLIGHT, TOLERANCE, STARTED = 0.05, 0.01 + 1e-9, 1.0
 """Least duration of a flight, tolerance of a found touch-down or lift-off, and duration of the start [s]."""
+FALLEN = 0.5
+"""Cosine of the tilt of the trunk from which on a robot has fallen."""
 METHODS = ("legs", "equations of motion", "identified", "forcegp")
 
 
@@ -84,8 +87,9 @@ METHODS = ("legs", "equations of motion", "identified", "forcegp")
 class Kind:
     """A legged robot of example-robot-data: its file, frames of the feet, radius of a foot [m], angles
     of joints while standing, stiffness of servos [N m/rad], height of a step [m], inertia of drives, usual
-    torque, which friction is relative to [N m], damping of servos over their stiffness [s], size and pace of the sway over those of quadrupeds, joints that
-    are locked, and balls of a foot, which are several for a flat one [m]."""
+    torque, which friction is relative to [N m], damping of servos over their stiffness [s], size and pace of
+    the sway over those of quadrupeds, largest push over the weight, joints that are locked, and balls of a
+    foot, which are several for a flat one [m]."""
 
     path: str
     feet: tuple[str, ...]
@@ -97,6 +101,7 @@ class Kind:
     load: float
     damping: float = 0.03
     sway: tuple[float, float] = (1.0, 1.0)
+    push: float = 0.2
     locked: str = "$"
     balls: tuple[tuple[float, float, float], ...] = ((0.0, 0.0, 0.0),)
 
@@ -139,6 +144,7 @@ ROBOTS = {
         30.0,
         damping=0.015,
         sway=(0.5, 0.35),
+        push=0.05,
         locked="(waist|.*shoulder|.*elbow|.*wrist).*",
         balls=((-0.05, 0.025, -0.03), (-0.05, -0.025, -0.03), (0.12, 0.03, -0.03), (0.12, -0.03, -0.03)),
     ),
@@ -147,8 +153,8 @@ ROBOTS = {
 
 @dataclass(frozen=True)
 class Gait:
-    """Wanted positions of the contacts `(contacts, 3)` in axes of the trunk over time, and shares of the weight
-    `(feet,)` for which servos are given torques ahead."""
+    """Wanted positions of the contacts `(contacts, 3)` in axes of the trunk over time, and shares of the
+    weight `(feet,)` for which servos are given torques ahead."""
 
     places: Callable[[float], Array]
     share: Callable[[float], Array] | None = None
@@ -224,7 +230,7 @@ class Legged:
         return q
 
     def angles(self, wanted: Callable[[float], Array], times: Array) -> Array:
-        """Angles `(n, joints)` that place the contacts at wanted positions `(contacts, 3)` in axes of the trunk."""
+        """Angles `(n, joints)` that place the contacts at wanted positions `(contacts, 3)`, in trunk axes."""
         model, q, rows = self.nominal, self.stand.copy(), []
         data = mujoco.MjData(model)
         J = np.zeros((3, model.nv))
@@ -290,8 +296,8 @@ class Legged:
         return Gait(wanted, share)
 
     def pushed(self) -> Callable[[float], Array]:
-        """Half sines of up to a fifth of the weight in random directions, each for half a second."""
-        size = 0.2 * 9.81 * self.true.body_mass.sum()
+        """Half sines of random sizes and directions, each for half a second."""
+        size = self.kind.push * 9.81 * self.true.body_mass.sum()
         forces = size * self.random.uniform(-1.0, 1.0, (100, 3)) / np.sqrt(3.0)
 
         def push(t: float) -> Array:
@@ -366,7 +372,11 @@ class Legged:
             for _ in range(every):
                 mujoco.mj_step(model, data)
         mujoco.set_mjcb_passive(None)
-        return {"t": times} | {key: np.array(value) for key, value in rows.items()}
+        log = {"t": times} | {key: np.array(value) for key, value in rows.items()}
+        upright = Rotation.from_quat(np.roll(log["q"][:, 3:7], -1, axis=1)).as_matrix()[:, 2, 2]
+        if upright.min() < FALLEN:
+            raise RuntimeError(f"the robot fell after {times[np.argmax(upright < FALLEN)]:.1f} s")
+        return log
 
     def _forces(self, data: Any) -> Array:
         """Forces of the floor on the contacts `(contacts, 3)` in world axes."""
@@ -541,8 +551,8 @@ def score(
     """RMSE of each axis over the total force on each foot [N], median σ and coverage of ±2σ.
 
     Args:
-        force: forces of all contacts `(n, 3 contacts)` with their covariance. Those of the balls of a flat foot
-            are scored in `balls`, too.
+        force: forces of all contacts `(n, 3 contacts)` with their covariance. Those of the balls of a flat
+            foot are scored in `balls`, too.
     """
     count, each = len(legged.kind.feet), len(legged.kind.balls)
     closed = torch.stack([data.contact[x] for x in legged.contacts], dim=-1)
@@ -663,9 +673,9 @@ def mapping(legged: Legged) -> str:
 
 
 def gaits(legged: Legged) -> dict[str, Gait]:
-    """A gait to learn from, and one for tests: a trot and a walk, or steps in place and a walk on two legs."""
+    """A gait to learn from and one for tests: a trot and a walk, or steps in place and a walk of a biped."""
     if len(legged.kind.feet) == 2:
-        return {"steps": legged.stepping(0.8, 0.3, 0.0, 0.11), "walk": legged.stepping(0.8, 0.4, 0.06, 0.1)}
+        return {"steps": legged.stepping(0.8, 0.3, 0.0, 0.11), "walk": legged.stepping(0.8, 0.4, 0.05, 0.105)}
     trot = legged.steps(np.array([0.0, 0.5, 0.5, 0.0]), 0.55, 1.8, np.array([0.04, 0.0, 0.0]))
     walk = legged.steps(np.array([0.0, 0.5, 0.75, 0.25]), 0.78, 1.0, np.array([0.05, 0.0, 0.0]))
     return {"trot": Gait(trot), "walk": Gait(walk)}
