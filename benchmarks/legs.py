@@ -695,14 +695,19 @@ def apart(times: Array, others: Array) -> Array:
     return others - times[np.abs(others[:, None] - times).argmin(axis=1)]
 
 
-def labels(spans: list[Any], acts: Array, t: Array) -> dict[str, Any]:
-    """Scores of the closed intervals of each foot, against rows with a force `(feet, n)`."""
+def labels(legged: Legged, spans: list[Any], acts: Array, t: Array) -> dict[str, Any]:
+    """Scores of the closed intervals of all contacts, against rows with a force `(contacts, n)`.
+
+    A flat foot is closed if one of its balls is.
+    """
+    shape = len(legged.kind.feet), len(legged.kind.balls), len(t)
+    closed = [np.any([(t >= a - 1e-6) & (t <= b + 1e-6) for a, b in each], axis=0) for each in spans]
+    found_rows, acts = (np.reshape(x, shape).any(axis=1) for x in (closed, acts))
     errors: dict[str, list[Array]] = {"touch_down": [], "lift_off": []}
     began, false, same = [], 0, []
-    for own, truth in zip(spans, acts, strict=True):
-        closed = np.any([(t >= a - 1e-6) & (t <= b + 1e-6) for a, b in own], axis=0)
-        same.append(float((closed == truth).mean()))
-        for key, true, found in zip(errors, switches(truth, t), switches(closed, t), strict=True):
+    for foot, truth in zip(found_rows, acts, strict=True):
+        same.append(float((foot == truth).mean()))
+        for key, true, found in zip(errors, switches(truth, t), switches(foot, t), strict=True):
             off, early = -apart(found, true), true < STARTED
             errors[key].append(off[~early])
             began.append(off[early])
@@ -735,7 +740,7 @@ def touchdown(name: str, friction: str, seed: int) -> list[dict[str, Any]]:
                 )
                 read = import_log(path, system, parse_mapping(mapping(legged).encode(), "mapping"))
             results.append({"gait": gait, "base": base, "rows_kept": len(read.data) / len(t)})
-            results[-1] |= labels([each.intervals for each in read.contacts], acts.T, t)
+            results[-1] |= labels(legged, [each.intervals for each in read.contacts], acts.T, t)
     return results
 
 
