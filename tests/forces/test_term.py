@@ -112,7 +112,7 @@ def test_a_law_that_is_not_imported_is_named_with_a_hint(
     parts = (
         r"unknown type in .*priors\.0 'drag'",
         "expected: one of .*joint_friction.*",
-        "hint: import the .*",
+        "hint: import the module that defines it before loading",
     )
     with pytest.raises(ForceGPError, match=r"\n  ".join(parts)):
         forcegp.load_model(tmp_path / "model")
