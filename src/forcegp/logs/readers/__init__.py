@@ -9,8 +9,8 @@ A reader is a function `(path, *, wanted, rows, progress)` that returns a `LogTa
 - If the format permits, only columns that `wanted` accepts and the first `rows` rows are read, and `progress`
   is called with the completed and the total work.
 - Sizes are checked with `guards` and `table.check_values` before memory is allocated. No code in a file runs.
-- Whatever is left out or assumed is a sentence in `remarks`. A damaged file raises `DataError`. Other
-  exceptions of the parser are converted by `read`.
+- Whatever is left out or assumed is a sentence in `remarks`. A damaged file raises `DataError`, to which
+  `guards.foreign` converts the exceptions of parsers.
 
 A new format needs an entry in `_READERS`, its first bytes in `_MAGIC` or its file name in `format_of`, and a
 writer in `WRITERS` of `tests/log_files.py`. The tests of imports, refusals and commands then cover it.
