@@ -148,7 +148,7 @@ LAYERS = (
 def layers() -> None:
     """Layers of the library, the highest on top."""
     count = len(LAYERS)
-    axis = canvas(7.4, 5.6, xlim=(-0.4, 12.2), ylim=(-0.1, 0.62 * count + 0.1))
+    axis = canvas(7.4, 6.3, xlim=(-0.4, 12.2), ylim=(-0.1, 0.62 * count + 0.1))
     for k, (names, what, color) in enumerate(LAYERS):
         y = 0.62 * (count - 1 - k)
         box(axis, 0.3, y, 4.9, 0.5, names, color, 8)
