@@ -118,7 +118,7 @@ class UnknownNameError(ForceGPError, LookupError):
         super().__init__(
             f"unknown {kind} {_shortened(repr(name), NAME_COMPARED)}",
             expected=f"one of {listed}{more}" if names else "none are defined",
-            hint="; or ".join(text for text in (did_you_mean(name, names), hint) if text) or None,
+            hint="; or ".join(text for text in (hint, did_you_mean(name, names)) if text) or None,
         )
 
 

@@ -122,7 +122,7 @@ def test_all_laws_of_the_library_are_public() -> None:
     """`forcegp.priors` imports them, so that saved models are read with all of them."""
     for module in pkgutil.iter_modules(folder.__path__, folder.__name__ + "."):
         importlib.import_module(module.name)
-    laws = [law for law in JointTerm.laws.values() if law.__module__.startswith("forcegp.")]
+    laws = [law for law in JointTerm.laws.values() if law.__module__.startswith(f"{folder.__name__}.")]
     assert len(laws) >= 4 and all(getattr(forcegp.priors, law.__name__) is law for law in laws)
 
 
