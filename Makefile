@@ -53,7 +53,7 @@ docs: $(READY)   ## the documentation site; runs the code of every page
 types: $(READY)  ## pyright
 	$(BIN)/pyright
 
-benchmark: $(READY)  ## every benchmark, results as JSON under out/benchmarks
+benchmark: $(READY)  ## run times and separation of forces, as JSON under out/benchmarks
 	@mkdir -p $(OUT)/benchmarks
 	@for name in dynamics inference rollout separation; do \
 	  echo "[benchmark] $$name"; $(BIN)/python benchmarks/$$name.py --json $(OUT)/benchmarks/$$name.json || exit 1; \

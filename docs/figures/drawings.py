@@ -133,8 +133,9 @@ LAYERS = (
     ("logs, checks", "logs of other programs; faults in a log", GREEN),
     ("scene, simulate, control", "scene files; physics engines; planned motion", GREEN),
     ("storage", "files of models", GREEN),
+    ("priors, learning", "public names of priors; hyperparameters from logs", ORANGE),
     ("forces", "the paper: unknown forces as Gaussian processes", ORANGE),
-    ("gp", "kernels and inference, without a robot", ORANGE),
+    ("gp, options", "kernels and inference, without a robot", ORANGE),
     ("data", "Dataset: columns, splits, derivatives", GREEN),
     ("constraints", "surfaces, contacts: A, b, L, T, P, H, λ", BLUE),
     ("compiled, derivatives, identification", "mechanics again: fast, differentiated, as a regressor", BLUE),
@@ -147,7 +148,7 @@ LAYERS = (
 def layers() -> None:
     """Layers of the library, the highest on top."""
     count = len(LAYERS)
-    axis = canvas(7.4, 5.6, xlim=(-0.4, 12.2), ylim=(-0.1, 0.62 * count + 0.1))
+    axis = canvas(7.4, 6.3, xlim=(-0.4, 12.2), ylim=(-0.1, 0.62 * count + 0.1))
     for k, (names, what, color) in enumerate(LAYERS):
         y = 0.62 * (count - 1 - k)
         box(axis, 0.3, y, 4.9, 0.5, names, color, 8)

@@ -111,14 +111,14 @@ class ConvergenceWarning(UserWarning):
 class UnknownNameError(ForceGPError, LookupError):
     """Raised if a name (of a joint, frame, model, …) does not exist; the message lists the valid names."""
 
-    def __init__(self, kind: str, name: object, valid: Iterable[str]) -> None:
+    def __init__(self, kind: str, name: object, valid: Iterable[str], hint: str | None = None) -> None:
         names = list(valid)
         more = f" and {len(names) - NAMES_COMPARED} more" if len(names) > NAMES_COMPARED else ""
         listed = ", ".join(names[:NAMES_COMPARED])
         super().__init__(
             f"unknown {kind} {_shortened(repr(name), NAME_COMPARED)}",
             expected=f"one of {listed}{more}" if names else "none are defined",
-            hint=did_you_mean(name, names),
+            hint="; or ".join(text for text in (hint, did_you_mean(name, names)) if text) or None,
         )
 
 

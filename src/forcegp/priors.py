@@ -1,4 +1,8 @@
-"""Priors on unknown forces, prior means, and measurements, of which a `StructuredGP` consists."""
+"""Priors on unknown forces, prior means, and measurements, of which a `StructuredGP` consists.
+
+Laws of joint friction register themselves when they are imported (`JointTerm.laws`). This module imports all
+laws of the library, so that models that contain them can be loaded.
+"""
 
 from forcegp.forces.measurements import Observation
 from forcegp.forces.priors.base import ForcePrior, OperatorForcePrior

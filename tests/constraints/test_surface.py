@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 import forcegp
+from forcegp.compiled.expression import Graph
 from forcegp.constraints import Cylinder, ImplicitSurface, Plane, Sphere, Surface
 from forcegp.errors import ForceGPError
 
@@ -58,6 +59,25 @@ def test_closed_forms_are_the_automatic_derivatives(
         assert torch.allclose(ours, theirs, rtol=ROUNDING, atol=ROUNDING)
     assert surface.value(p).shape == batch
     assert surface.gradient(p).shape == (*batch, 3)
+
+
+@surfaces
+def test_scalars_of_a_program_have_the_values_of_tensors(surface: Surface, function) -> None:
+    p, v = points()
+    graph = Graph()
+    c, normal, curvature = surface.scalars(graph.constants(p.numpy()), graph.constants(v.numpy()))
+    found = torch.tensor([x.value for x in (c, *normal, curvature)], dtype=torch.float64)
+    expected = torch.stack([surface.value(p), *surface.gradient(p), surface.curvature(p, v)])
+    assert surface.has_scalars
+    assert torch.allclose(found, expected, rtol=ROUNDING, atol=ROUNDING)
+
+
+def test_a_surface_with_its_own_value_does_not_inherit_scalars() -> None:
+    class Raised(Plane):
+        def value(self, p: Tensor) -> Tensor:
+            return super().value(p) - 0.1
+
+    assert not Raised().has_scalars and not ImplicitSurface(plane_function).has_scalars
 
 
 @surfaces

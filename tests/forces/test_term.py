@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import importlib
+import pkgutil
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -10,7 +12,8 @@ import torch
 from torch import Tensor
 
 import forcegp
-from forcegp.errors import ModelError
+from forcegp.errors import ForceGPError, ModelError
+from forcegp.forces import priors as folder
 from forcegp.forces.priors.joint import JointFrictionPrior
 from forcegp.forces.priors.memory import DISTANCES, BristlePrior, bristles
 from forcegp.forces.term import Array, JointState, JointTerm, exp
@@ -99,6 +102,28 @@ def test_a_saved_law_keeps_its_parameters(fit, tmp_path: Path) -> None:
     for _ in range(10):
         again = forcegp.load_model(tmp_path / "model")
         assert isinstance(again, StructuredFit) and again.parameters() == fit.parameters()
+
+
+def test_a_law_that_is_not_imported_is_named_with_a_hint(
+    fit, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fit.save(tmp_path / "model")
+    monkeypatch.delitem(JointTerm.laws, "drag")
+    parts = (
+        r"unknown type in .*priors\.0 'drag'",
+        "expected: one of .*joint_friction.*",
+        "hint: import the module that defines it before loading",
+    )
+    with pytest.raises(ForceGPError, match=r"\n  ".join(parts)):
+        forcegp.load_model(tmp_path / "model")
+
+
+def test_all_laws_of_the_library_are_public() -> None:
+    """`forcegp.priors` imports them, so that saved models are read with all of them."""
+    for module in pkgutil.iter_modules(folder.__path__, folder.__name__ + "."):
+        importlib.import_module(module.name)
+    laws = [law for law in JointTerm.laws.values() if law.__module__.startswith(f"{folder.__name__}.")]
+    assert len(laws) >= 4 and all(getattr(forcegp.priors, law.__name__) is law for law in laws)
 
 
 def test_laws_may_use_magnitudes_powers_and_logarithms() -> None:

@@ -3,6 +3,10 @@
 The gradient points out of the solid, so the multiplier of a contact under pressure is λ ≥ 0. For all surfaces
 except `ImplicitSurface`, c is the signed distance and the gradient is the unit normal.
 
+A class contains all that the library needs of a surface: c and its derivatives in PyTorch, the same on the
+scalars of a program (`compiled/expression.py`), from which C code and CasADi functions are derived, and the
+geometry in a simulation. The last two are optional.
+
 `SurfaceSchema` describes surfaces in scene files and saved models, which are validated against these classes.
 The field `type` selects the class.
 """
@@ -13,8 +17,9 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
+import numpy as np
 import torch
 from pydantic import Field
 from torch import Tensor
@@ -22,9 +27,37 @@ from torch import Tensor
 from forcegp.errors import ParameterError
 from forcegp.types import Scalars, Vector3
 
+INFINITE = 100.0
+"""Half-length of the solid that represents an infinite cylinder [m]."""
+
+
+class Solid(NamedTuple):
+    """A primitive geometry of MuJoCo that represents a surface.
+
+    Attributes:
+        shape: name of the primitive, such as `plane` or `sphere`.
+        size: its three sizes [m], as MuJoCo defines them.
+        position: its position in the world [m].
+        axis: direction of its z axis in the world.
+    """
+
+    shape: str
+    size: Sequence[float]
+    position: Sequence[float]
+    axis: Sequence[float] = (0.0, 0.0, 1.0)
+
 
 class Surface(ABC):
     """A surface with the derivatives that a contact needs, evaluated at batches of points in the world."""
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        if "value" in cls.__dict__ and "scalars" not in cls.__dict__:
+            cls.scalars = Surface.scalars
+        cls.has_scalars = cls.scalars is not Surface.scalars
+
+    has_scalars = False
+    """Whether the class defines `scalars` for its own `value`, so that contacts can be exported."""
 
     @abstractmethod
     def value(self, p: Vector3) -> Scalars:
@@ -52,6 +85,18 @@ class Surface(ABC):
             expected="a plane, a sphere or a cylinder, whose c is the signed distance",
             hint="define raised() in a subclass",
         )
+
+    def scalars(self, p: np.ndarray, v: np.ndarray) -> tuple[Any, np.ndarray, Any]:
+        """Return c, ∇c and vᵀ ∇²c v for the scalars of a program, which C and CasADi evaluate.
+
+        Args:
+            p, v: a point and its velocity, each a NumPy array `(3,)` of scalars.
+        """
+        raise NotImplementedError
+
+    def solid(self) -> Solid | None:
+        """Return the geometry that represents the surface in MuJoCo, or `None` if there is none."""
+        return None
 
 
 def _vector(values: Sequence[float], like: Tensor) -> Tensor:
@@ -115,6 +160,14 @@ class Plane(Surface):
     def curvature(self, p: Vector3, v: Vector3) -> Scalars:
         return torch.zeros_like(p[..., 0])
 
+    def scalars(self, p: np.ndarray, v: np.ndarray) -> tuple[Any, np.ndarray, Any]:
+        n = np.array(self.normal) + 0.0 * p
+        return n @ p - self.offset, n, 0.0 * p[0]
+
+    def solid(self) -> Solid:
+        position = self.offset * np.array(self.normal)
+        return Solid("plane", (0.0, 0.0, 1.0), position.tolist(), self.normal)
+
 
 class _Round(Surface):
     """c(p) = |r| − radius, where `_across` computes r from p − center. Contact is from outside."""
@@ -133,7 +186,7 @@ class _Round(Surface):
                 got=self.radius,
             )
 
-    def _across(self, x: Tensor) -> Tensor:
+    def _across(self, x: Any) -> Any:
         return x
 
     def raised(self, distance: float) -> Surface:
@@ -152,6 +205,13 @@ class _Round(Surface):
         distance = torch.linalg.vector_norm(r, dim=-1)
         along = (r * v).sum(-1) / distance
         return ((v * v).sum(-1) - along**2) / distance
+
+    def scalars(self, p: np.ndarray, v: np.ndarray) -> tuple[Any, np.ndarray, Any]:
+        r, v = self._across(p - np.array(self.center)), self._across(v)
+        distance = (r @ r).sqrt()
+        n = r / distance
+        along = n @ v
+        return distance - self.radius, n, (v @ v - along * along) / distance
 
 
 @dataclass(frozen=True)
@@ -174,6 +234,9 @@ class Sphere(_Round):
     center: Sequence[float]
     radius: float
     type: Literal["sphere"] = field(default="sphere", kw_only=True, repr=False)
+
+    def solid(self) -> Solid:
+        return Solid("sphere", (self.radius, 0.0, 0.0), self.center)
 
 
 @dataclass(frozen=True)
@@ -203,9 +266,16 @@ class Cylinder(_Round):
         super().__post_init__()
         object.__setattr__(self, "axis", _unit(self.axis, "the cylinder's axis"))
 
-    def _across(self, x: Tensor) -> Tensor:
-        a = _vector(self.axis, x)
-        return x - (x @ a)[..., None] * a
+    def _across(self, x: Any) -> Any:
+        # x − a aᵀx
+        if isinstance(x, Tensor):
+            a = _vector(self.axis, x)
+            return x - (x @ a)[..., None] * a
+        a = np.array(self.axis)
+        return x - a * (x @ a)
+
+    def solid(self) -> Solid:
+        return Solid("cylinder", (self.radius, INFINITE, 0.0), self.center, self.axis)
 
 
 SurfaceSchema = Annotated[Plane | Sphere | Cylinder, Field(discriminator="type")]

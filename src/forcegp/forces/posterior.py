@@ -1,4 +1,4 @@
-"""Prior and posterior (eqs. 22 to 25) of the impressed forces, and functions drawn from the posterior.
+"""Prior and posterior (eq. 22) of the impressed forces, and functions drawn from the posterior.
 
 Q̄ = m + Σ_p E_p f_p with f_p ~ GP(0, k_p), plus contact friction proportional to the multiplier. Every
 quantity z = B_Q Q + B_z Q_z + o is an affine map of the latent forces f_p, so its posterior follows from
@@ -156,8 +156,11 @@ class ForcePosterior:
         return self.process.rows(system, at, self.process.coupled(system, at, z))
 
     def read(self, system: ConstrainedSystem, at: States, z: AffineMap) -> tuple[Tensor, Tensor]:
-        """Return the posterior mean `(n, d)` and covariance `(n, d, d)` of a quantity, excluding noise."""
-        # o + B (m + Σ E μ), and W Cov(f) Wᵀ (eqs. 23 to 25)
+        """Return the posterior mean `(n, d)` and covariance `(n, d, d)` of a quantity, excluding noise.
+
+        For the multiplier, the mean is that of eq. 25, with −Lᵀ for L.
+        """
+        # o + B (m + Σ E μ), and W Cov(f) Wᵀ (eqs. 23 and 24)
         rows = self.rows(system, at, z)
         return rows.target + self.latent.mean(rows), self.latent.covariance(rows)
 

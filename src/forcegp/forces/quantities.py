@@ -1,6 +1,6 @@
 """Quantities as affine maps of the forces, z = B_Q Q + B_z Q_z + o.
 
-The operators follow from M q̈ = Q̄ + Aᵀλ and A q̈ = b. They are those of eqs. 19 to 25 with two corrections:
+The operators follow from M q̈ = Q̄ + Aᵀλ and A q̈ = b. They are those of eqs. 19 and 20 with two corrections:
 the operator from force to λ is −Lᵀ, and λ depends on all impressed forces Q + Q_z.
 
 `linearize_field` differentiates q̈ and λ under a force field with respect to the state and the torque.
@@ -178,7 +178,7 @@ def _free_acceleration(system: ConstrainedSystem, at: States) -> AffineMap:
 
 
 def _multiplier(system: ConstrainedSystem, at: States) -> AffineMap:
-    """Return the map λ = (A M⁻¹ Aᵀ)⁺ b − Lᵀ (Q + Q_z) (eqs. 16 and 19 with the two corrections)."""
+    """Return the map λ = (A M⁻¹ Aᵀ)⁺ b − Lᵀ (Q + Q_z) (eq. 16 with the two corrections)."""
     B = -at.eom.L.mT
     return AffineMap(B, B, B, (at.eom.constraint_inertia @ at.eom.b[..., None])[..., 0])
 

@@ -195,13 +195,13 @@ class ExactPosterior:
         return 0.5 * (covariance + covariance.mT)
 
     def _cross(self, new: Block) -> Tensor:
-        """Return the covariance between the rows of a block and the data, `(new, rows)` (eqs. 10 and 19)."""
+        """Return Σ_*X, the covariance of new rows of any quantity with the data, `(new, rows)` (eq. 19)."""
         starts = offsets(self.blocks)
         cross = new.target.new_zeros(new.rows, starts[-1])
         for p, W in enumerate(new.operators):
             for g, depends in enumerate(self._depends[p]):
                 if depends and bool(W.any()):
-                    # Σ_*X = Σ_p W_* k_p(x_*, X) Wᵀ (eqs. 19 and 20)
+                    # Σ_*X = Σ_p W_* k_p(x_*, X) Wᵀ
                     k = self.kernels_to_data[p][g](new.features[p])
                     add_rows(cross[:, starts[g] : starts[g + 1]], W, k, self.blocks[g].operators[p])
         return cross

@@ -81,15 +81,16 @@ def cross_gram(
     blocks1: Sequence[Block],
     blocks2: Sequence[Block] | None = None,
 ) -> Tensor:
-    """Return the covariance between the rows of two lists of blocks, `(rows1, rows2)` (eqs. 10, 13 and 19).
+    """Return the covariance K = Σ_p W_p k_p W_pᵀ of a sum of processes (eq. 13), `(rows1, rows2)`.
 
+    K_ij is the covariance between row i of the first list of blocks and row j of the second (Σ in eq. 10).
     If the second list is omitted, it equals the first, and only the lower triangle of the result is valid.
     """
     lower, blocks2 = blocks2 is None, blocks1 if blocks2 is None else blocks2
     starts1, starts2 = offsets(blocks1), offsets(blocks2)
     like = blocks1[0].target
     K = torch.zeros(starts1[-1], starts2[-1], dtype=like.dtype, device=like.device)
-    # K = Σ_p W_p k_p W_pᵀ (eqs. 13 and 15)
+    # K = Σ_p W_p k_p W_pᵀ (eq. 13)
     for p, process_params, g, h in _pairs(priors, params, blocks1, blocks2, lower):
         one, two = blocks1[g], blocks2[h]
         k = priors[p].kernel.covariance(process_params, one.features[p], two.features[p])

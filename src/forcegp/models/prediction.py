@@ -244,7 +244,7 @@ class Predictor(ForwardModel):
         system: ConstrainedSystem | None = None,
         noise: bool = False,
     ) -> Prediction:
-        """Predict the mean and covariance of a quantity. `StructuredGP` uses the posterior (eqs. 22–25).
+        """Predict the mean and covariance of a quantity. `StructuredGP` uses the posterior (eq. 22).
 
         Args:
             q, qd, tau: states, `(*batch, nq)`.

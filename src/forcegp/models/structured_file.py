@@ -22,15 +22,8 @@ from forcegp.forces.measurements import Measurement, Training, plain
 from forcegp.forces.noise import Noise
 from forcegp.forces.posterior import ForcePosterior
 from forcegp.forces.priors.base import ANALYTICAL
-from forcegp.forces.priors.constants import DrivePrior, OffsetPrior, PerRecording
-from forcegp.forces.priors.contact import ContactForcePrior, NormalForcePrior, SlidingFrictionPrior
-from forcegp.forces.priors.inertial import InertialPrior, PayloadPrior
-from forcegp.forces.priors.joint import AnalyticalMean, JointForcePrior
-from forcegp.forces.priors.memory import BristlePrior  # noqa: F401  (registers itself)
-from forcegp.forces.priors.residual import ResidualPrior
 from forcegp.forces.problem import Problem, analytical_parameters, kernel_parameters
 from forcegp.forces.quantities import states
-from forcegp.forces.term import JointTerm
 from forcegp.gp import kernels
 from forcegp.gp.exact import ExactPosterior
 from forcegp.gp.features import Standardization
@@ -38,6 +31,20 @@ from forcegp.gp.sparse import SparsePosterior
 from forcegp.learning.specification import Specification, constant_inputs
 from forcegp.models.fit_result import FitResult
 from forcegp.options import StructuredOptions
+from forcegp.priors import (
+    AnalyticalMean,
+    ContactForcePrior,
+    DrivePrior,
+    InertialPrior,
+    JointForcePrior,
+    JointTerm,
+    NormalForcePrior,
+    OffsetPrior,
+    PayloadPrior,
+    PerRecording,
+    ResidualPrior,
+    SlidingFrictionPrior,
+)
 from forcegp.robot.parameters import AnalyticalParameters
 from forcegp.storage.descriptions import decode, encode
 from forcegp.storage.model_file import ModelHeader
@@ -64,7 +71,8 @@ CLASSES: dict[str, type] = {
     "contact": ContactForcePrior,
     "sliding_friction": SlidingFrictionPrior,
 }
-"""Classes that can be saved, by their names in the file, besides the terms in `JointTerm.laws`."""
+"""Classes that can be saved, by their names in the file, besides the laws in `JointTerm.laws`, which contains
+those of the library because `forcegp.priors` imports them."""
 
 
 def classes() -> dict[str, type]:

@@ -1,7 +1,7 @@
 """Gaussian-process priors on forces, mapped to accelerations and multipliers by known mechanics.
 
 The acceleration has the prior q̈ ~ GP(L b + H m_Q, H k_Q Hᵀ) (eq. 15). Priors on all other quantities are
-similar (eqs. 19 to 25). `fit` learns the hyperparameters (`learning/fit.py`) and conditions on the
+similar (eqs. 19 and 20). `fit` learns the hyperparameters (`learning/fit.py`) and conditions on the
 data (`structured_fit.conditioned`). `gram` in `gp/likelihood.py` computes the covariance in eq. 10.
 """
 
@@ -137,7 +137,13 @@ class StructuredGP(Model[StructuredFit]):
         progress: FitProgress | None = None,
         client: Client | None = None,
     ) -> StructuredFit:
-        """Learn the hyperparameters by maximum a posteriori estimation, and condition the forces on the data.
+        """Learn the hyperparameters, and condition the forces on the data.
+
+        If all priors consist of columns and torque noise is learned, their scales are the fixed point of the
+        evidence, s² ← (s² |ŵ|² + s₀²)/(γ + 1) (MacKay, *Bayesian interpolation*, 1992; Tipping, *Sparse
+        Bayesian learning*, 2001), which alternates with Fisher scoring of the variances of rows
+        (`learning/evidence.py`, `learning/scales.py`). All other hyperparameters are maximum a posteriori
+        estimates (`learning/search.py`).
 
         Args:
             data: measured accelerations, any mixture of measurements, or a streamed log. Fitting a streamed

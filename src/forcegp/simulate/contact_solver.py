@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from forcegp.constraints import ConstrainedSystem, Cylinder, Plane, Sphere, SurfaceContact
+from forcegp.constraints import ConstrainedSystem, SurfaceContact
 from forcegp.errors import ForceGPError, UnsupportedRobotError, optional_module
 from forcegp.robot.model import BASE, RobotModel
 from forcegp.robot.shapes import turn_z
@@ -16,8 +15,6 @@ from forcegp.simulate.config import ContactSolver
 from forcegp.simulate.engines import NEEDS_MUJOCO, MuJoCoWorld
 from forcegp.simulate.urdf import compile_spec, link_name, write_urdf
 
-CYLINDER_LENGTH = 100.0
-"""Half-length of the cylinder that represents an infinite cylinder [m]."""
 IMPEDANCE = [0.01, 0.95, 0.0002, 0.5, 2.0]
 """Parameters of MuJoCo's impedance, which grows from almost zero within 0.2 mm to avoid force jumps."""
 SOLVED = 1e-15
@@ -177,21 +174,12 @@ def tip_of(robot: RobotModel, contact: SurfaceContact, radius: float) -> tuple[i
 
 def geometry_of(mujoco: Any, contact: SurfaceContact) -> dict[str, Any]:
     """Return the type, size and pose of the MuJoCo geometry for a contact surface."""
-    surface, geom = contact.surface, mujoco.mjtGeom
-
-    def along(axis: Sequence[float]) -> np.ndarray:
-        """Return the quaternion (w, x, y, z) of a rotation that turns z into an axis."""
-        return Rotation.from_matrix(turn_z(np.array(axis))).as_quat()[[3, 0, 1, 2]]
-
-    if isinstance(surface, Plane):
-        pose = {"pos": surface.offset * np.array(surface.normal), "quat": along(surface.normal)}
-        return {"type": geom.mjGEOM_PLANE, "size": [0.0, 0.0, 1.0], **pose}
-    if isinstance(surface, Sphere):
-        return {"type": geom.mjGEOM_SPHERE, "size": [surface.radius, 0.0, 0.0], "pos": [*surface.center]}
-    if isinstance(surface, Cylinder):
-        size = [surface.radius, CYLINDER_LENGTH, 0.0]
-        pose = {"pos": [*surface.center], "quat": along(surface.axis)}
-        return {"type": geom.mjGEOM_CYLINDER, "size": size, **pose}
-    text = f"the contact solver has no geometry for the surface of {contact.name!r}"
-    expected = "a plane, a sphere or a cylinder"
-    raise ForceGPError(text, expected=expected, got=type(surface).__name__, hint='use contact = "rigid"')
+    solid = contact.surface.solid()
+    if solid is None:
+        text = f"the contact solver has no geometry for the surface of {contact.name!r}"
+        expected, hint = "a surface with `solid`, such as a plane", 'use contact = "rigid"'
+        raise ForceGPError(text, expected=expected, got=type(contact.surface).__name__, hint=hint)
+    # The quaternion (w, x, y, z) of a rotation that turns z into the axis.
+    turned = Rotation.from_matrix(turn_z(np.array(solid.axis))).as_quat()[[3, 0, 1, 2]]
+    kind = getattr(mujoco.mjtGeom, f"mjGEOM_{solid.shape.upper()}")
+    return {"type": kind, "size": [*solid.size], "pos": [*solid.position], "quat": turned}

@@ -13,11 +13,13 @@ from typing import Any, get_type_hints
 
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
-from forcegp.errors import ModelError, check_name, near_names
+from forcegp.errors import ModelError, UnknownNameError, near_names
 
 Classes = Mapping[str, type]
 """Classes that may be written and read, keyed by their names in the file."""
 
+IMPORT = "import the module that defines it before loading"
+"""What to do if a file contains a class that is not in the table, such as a law of the user."""
 MAX_DEPTH = 40
 """Maximum nesting depth. A sum of kernels has one level per term."""
 _CHECK = ConfigDict(arbitrary_types_allowed=True, strict=True, allow_inf_nan=False)
@@ -55,7 +57,8 @@ def decode(json: Any, classes: Classes, place: str, depth: int = 0, *, whole: bo
     if not isinstance(json, dict):
         return json
     name = str(json.get("type"))
-    check_name(f"type in {place}", name, classes)
+    if name not in classes:
+        raise UnknownNameError(f"type in {place}", name, classes, IMPORT)
     kind = classes[name]
     assert is_dataclass(kind)
     members = {key: value for key, value in json.items() if key != "type"}

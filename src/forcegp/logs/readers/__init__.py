@@ -1,4 +1,20 @@
-"""Detection of log formats by first bytes, then by file name. Formats that can run code are rejected."""
+"""Detection of log formats by first bytes, then by file name. Formats that can run code are rejected.
+
+A reader is a function `(path, *, wanted, rows, progress)` that returns a `LogTable`:
+
+- Columns are float64 `(n,)` with the names and units of the log. A value that is missing or not a number is
+  NaN, an array `(n, d)` becomes `name[0]` to `name[d-1]`, and names are at most `limits.LOG_NAME` long.
+- Columns with a common clock form a `Stream`; those of the main table come first. Time remains a column, as
+  no quantity has a meaning before the mapping is applied.
+- If the format permits, only columns that `wanted` accepts and the first `rows` rows are read, and `progress`
+  is called with the completed and the total work.
+- Sizes are checked with `guards` and `table.check_values` before memory is allocated. No code in a file runs.
+- Whatever is left out or assumed is a sentence in `remarks`. A damaged file raises `DataError`, to which
+  `guards.foreign` converts the exceptions of parsers.
+
+A new format needs an entry in `_READERS`, its first bytes in `_MAGIC` or its file name in `format_of`, and a
+writer in `WRITERS` of `tests/log_files.py`. The tests of imports, refusals and commands then cover it.
+"""
 
 from __future__ import annotations
 

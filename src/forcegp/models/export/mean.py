@@ -31,7 +31,7 @@ from forcegp.compiled.program import (
     cross,
     numbers,
 )
-from forcegp.constraints import Cylinder, Plane, Sphere, SurfaceContact
+from forcegp.constraints import SurfaceContact
 from forcegp.constraints.gauss import FACING_DOWN
 from forcegp.errors import ModelError
 from forcegp.forces.external_wrench import ROWS, WrenchFrame
@@ -184,7 +184,7 @@ class Mean:
         at = np.asarray([float(x) for x in point])
         _, center, J, bias = _point_blocks(self.links, self.robot, self.robot.frame_index(frame), at)
         twist = J @ self.qd
-        normal, c, curvature = self._surface(contact.center_surface, center, twist[3:])
+        c, normal, curvature = contact.center_surface.scalars(center, twist[3:])
         arm = normal * -float(contact.radius)
         jacobian = J[3:] + np.stack([cross(J[:3, j], arm) for j in range(n)], axis=1)
         velocity, A = twist[3:] + cross(twist[:3], arm), normal @ J[3:]
@@ -204,22 +204,6 @@ class Mean:
             np.array([b], dtype=object),
             np.array([c], dtype=object),
         )
-
-    def _surface(self, surface: object, p: Scalars, v: Scalars) -> tuple[Scalars, Scalar, Scalar]:
-        """Return the normal, the signed distance c and vᵀ (∇²c) v at a point p that has velocity v."""
-        constants = self.graph.constants
-        if isinstance(surface, Plane):
-            n = constants(surface.normal)
-            return n, n @ p - surface.offset, self.graph.constant(0.0)
-        assert isinstance(surface, Sphere | Cylinder)
-        r = p - constants(surface.center)
-        if isinstance(surface, Cylinder):
-            axis = constants(surface.axis)
-            r, v = r - axis * (r @ axis), v - axis * (v @ axis)
-        length = (r @ r).sqrt()
-        n = r / length
-        along = n @ v
-        return n, length - float(surface.radius), (v @ v - along * along) / length
 
     def _tangents(self, n: Scalars) -> Scalars:
         """Return R e_x and R e_y for the smallest rotation with R e_z = n, or a fixed frame if n is −e_z."""

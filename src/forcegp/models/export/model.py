@@ -20,7 +20,7 @@ from itertools import accumulate
 import torch
 from torch import Tensor
 
-from forcegp.constraints import ConstrainedSystem, Cylinder, Plane, Sphere, SurfaceContact
+from forcegp.constraints import ConstrainedSystem, SurfaceContact
 from forcegp.errors import ModelError
 from forcegp.forces.external_wrench import WrenchFrame
 from forcegp.forces.posterior import ForcePosterior
@@ -172,8 +172,9 @@ class ExportedModel:
         for each in self.system.contacts:
             if not isinstance(each, SurfaceContact) or each.stick_speed is not None:
                 raise _no_c("contact", each.name, each, "a SurfaceContact that always slides")
-            if type(each.surface) not in (Plane, Sphere, Cylinder):
-                raise _no_c("surface of contact", each.name, each.surface, "plane, sphere or cylinder")
+            if not each.surface.has_scalars:
+                expected = "a surface with `scalars`, such as a plane"
+                raise _no_c("surface of contact", each.name, each.surface, expected)
         if not isinstance(self.posterior.process.mean, joint.AnalyticalMean):
             raise _no_c("mean", "Q", self.posterior.process.mean, "an AnalyticalMean")
         for prior in self.posterior.priors:
