@@ -702,10 +702,10 @@ def labels(legged: Legged, spans: list[Any], acts: Array, t: Array) -> dict[str,
     """
     shape = len(legged.kind.feet), len(legged.kind.balls), len(t)
     closed = [np.any([(t >= a - 1e-6) & (t <= b + 1e-6) for a, b in each], axis=0) for each in spans]
-    found_rows, acts = (np.reshape(x, shape).any(axis=1) for x in (closed, acts))
+    feet, truths = (np.reshape(x, shape).any(axis=1) for x in (closed, acts))
     errors: dict[str, list[Array]] = {"touch_down": [], "lift_off": []}
     began, false, same = [], 0, []
-    for foot, truth in zip(found_rows, acts, strict=True):
+    for foot, truth in zip(feet, truths, strict=True):
         same.append(float((foot == truth).mean()))
         for key, true, found in zip(errors, switches(truth, t), switches(foot, t), strict=True):
             off, early = -apart(found, true), true < STARTED

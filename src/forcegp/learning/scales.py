@@ -53,8 +53,8 @@ STEPS, ACCURACY, DIVISIONS = 50, 1e-3, 16
 """Maximum number of steps of Fisher scoring in one alternation, relative change at which they end, and
 maximum number of times that a step is divided."""
 RELAXATION = (0.1, 3.0)
-"""Least and largest relaxation of steps. Without relaxation, a biped with eight contacts takes 3155 steps in place
-of 320 (57 of 84 alternations end at `STEPS`), and `ur5_wiping` 263 in place of 202."""
+"""Least and largest relaxation of steps. Without relaxation, a biped with eight contacts takes 3155 steps
+instead of 320 (57 of 84 alternations end at `STEPS`), and `ur5_wiping` 263 instead of 202."""
 LEAST_VARIANCE = EXACT**2
 """Variance of torques that is stored in place of zero [N² m², N²]."""
 ROUNDING = 32.0
