@@ -11,6 +11,7 @@ import torch
 
 import forcegp
 from forcegp.forces.noise import EXACT, TORQUE_NOISE
+from forcegp.forces.posterior import MEMORY
 from forcegp.forces.priors.joint import JointFrictionPrior
 from forcegp.forces.quantities import states
 from forcegp.models.structured_fit import StructuredFit
@@ -23,11 +24,15 @@ import legs
 
 
 @cache
+def solo() -> legs.Legged:
+    return legs.Legged("solo12", "coulomb", 3)
+
+
+@cache
 def walking() -> tuple[forcegp.ConstrainedSystem, forcegp.Dataset, forcegp.Dataset, float]:
     """A Solo12 that sways and trots, then walks, and the mass that its trunk has above the file."""
-    legged = legs.Legged("solo12", "coulomb", 3)
-    trot = legged.steps(np.array([0.0, 0.5, 0.5, 0.0]), 0.55, 1.8, np.array([0.04, 0.0, 0.0]))
-    walk = legged.steps(np.array([0.0, 0.5, 0.75, 0.25]), 0.78, 1.0, np.array([0.05, 0.0, 0.0]))
+    legged = solo()
+    trot, walk = legs.gaits(legged).values()
     parts = [legs.dataset(legged, legged.record(*part)) for part in ((legged.sway(), 4.0), (trot, 6.0))]
     test = legs.dataset(legged, legged.record(walk, 4.0))
     added = float(legged.true.body_mass[legged.trunk] - legged.nominal.body_mass[legged.trunk])
@@ -68,9 +73,9 @@ def test_feet_of_a_walking_robot() -> None:
     assert read.mean.shape == (len(test), 12) and list(read.parts) == list(system.contact_names)
     assert read.std is not None
     force, std = ({f: x[:, own] for f, own in read.parts.items()} for x in (read.mean, read.std))
-    own = legs.score(test, force, std)
-    plain = legs.score(test, legs.Plain(system, train, False).forces(test))
-    alone = legs.score(test, legs.of_legs(system, test))
+    own = legs.score(solo(), test, read.mean, read.covariance)
+    plain = legs.score(solo(), test, legs.Plain(system, train, False).forces(test))
+    alone = legs.score(solo(), test, legs.of_legs(solo(), system, test))
     sizes = [float(np.linalg.norm(x["rmse_N"])) for x in (own, plain, alone)]
     assert sizes[0] < 0.6 * sizes[1] and sizes[0] < 0.4 * sizes[2]
     assert np.mean(own["coverage"]) > 0.75
@@ -96,6 +101,7 @@ def test_the_base_has_exact_torques_and_the_trunk_is_weighed() -> None:
     fit = fitted()
     noise = fit.hyperparameters[TORQUE_NOISE].exp()
     assert noise[:6].tolist() == pytest.approx([EXACT] * 6) and float(noise[6:].min()) > 100.0 * EXACT
+    assert float(fit.hyperparameters[MEMORY][:6].exp().max()) < 1e-9
     found = {each.name: each for each in fit.parameters()}
     assert not any("base" in name for name in found if not name.startswith("inertial."))
     assert not any(name.startswith("inertial.drive of base") for name in found)

@@ -292,6 +292,7 @@ def memory_noise(scales: Scales) -> Tensors:
             V = scales.evidence.variance[columns, columns].view(*w.shape, *w.shape)
             V = torch.stack([V[j, :, j] for j in range(len(w))])
             each = ((w[:, :, None] * w[:, None] + V) * square).sum((1, 2))
+            each = each * problem.system.robot.driven if prior.needs_drive else each
             variance[MEMORY] = variance.get(MEMORY, 0.0) + each
     return {key: 0.5 * value.clamp(min=1e-24).log() for key, value in variance.items()}
 
