@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol, runtime_checkable
 
@@ -196,9 +196,15 @@ def contact_force(
     closed = data.active(read).repeat_interleave(AXES, dim=-1)
     mean, covariance = mean[:, : closed.shape[-1]], covariance[:, : closed.shape[-1], : closed.shape[-1]]
     mean, covariance = mean * closed, covariance * closed[:, None] * closed[..., None]
-    parts = {name: slice(AXES * k, AXES * (k + 1)) for k, name in enumerate(read)}
-    parts = {"contact_force": slice(0, AXES)} if len(read) == 1 else parts
-    return Prediction(mean, covariance, parts, fit.beyond(data.qd, data.tau), fit.system.robot.joint_names)
+    far, joints = fit.beyond(data.qd, data.tau), fit.system.robot.joint_names
+    return Prediction(mean, covariance, parts_of_contacts(read), far, joints)
+
+
+def parts_of_contacts(names: Sequence[str]) -> dict[str, slice]:
+    """Return the slice of each contact in an array of their forces, or of the force of a single contact."""
+    if len(names) == 1:
+        return {"contact_force": slice(0, AXES)}
+    return {name: slice(AXES * k, AXES * (k + 1)) for k, name in enumerate(names)}
 
 
 def surface_contacts(system: ConstrainedSystem, first: str | None) -> tuple[str, ...]:

@@ -302,44 +302,27 @@ typedef struct {
   double mean[COMPONENTS], prior[COMPONENTS]; /* posterior mean of f, and its prior variance */
   double rest[COMPONENTS];                    /* diagonal part D of the posterior covariance */
   double E[COMPONENTS][NQ];                   /* generalized force of each f */
-  double T[COMPONENTS][RANK];                 /* the covariance is D + T T^T or, with SIGN -1, D - T T^T */
+  double V[FUNCTIONS];                        /* whitened functions of all components */
   const forcegp_learned *learned;             /* the online state, or NULL */
   const double *folded;                       /* weights of kernels and features; NULL means those of the mean */
-  double *functions;                          /* output for the whitened functions, or NULL */
 } latent;
-
-/* row = V^T C, the functions V of a component in the columns from `first` on */
-static void root_row(const double *restrict C, const double *restrict V, int n, int first, double *restrict row) {
-  for (int c = 0; c < first; ++c) row[c] = 0.0;
-  combine(C, V, n, RANK - first, row + first);
-}
 
 /* posterior of component k from its functions V: m covariances k(x, Z), with prior variance `variance`, and
  * features phi(x) */
 static void component(const double *restrict V, int m, int features, double variance, const double *restrict weights,
-                      const double *restrict whitening, int kept, const double *restrict C, int first, int spread,
-                      int k, latent *restrict f) {
-  const double more = dot(V + m, V + m, features), *functions = V;
-  double white[MOST_FUNCTIONS];
+                      const double *restrict whitening, int kept, int spread, int k, latent *restrict f) {
+  const double more = dot(V + m, V + m, features);
+  double *restrict white = f->V + FUNCTION[k];
   if (f->folded) weights = f->folded + FOLDED[k];
   f->mean[k] = dot(V, weights, m + features);
   f->prior[k] = f->rest[k] = SIGN > 0.0 ? variance : variance + more; /* squares of features do not cancel */
   if (!spread) return;
   if (whitening) { /* D = k - |R^T k(Z, x)|^2, the residual variance given the support points */
     combine(whitening, V, m, kept, white);
-    memcpy(white + kept, V + m, sizeof(double) * features);
     f->rest[k] = fmax(variance - dot(white, white, kept), 0.0);
-    functions = white, m = kept;
-  }
-#if ONLINE
-  if (f->functions) memcpy(f->functions + first, functions, sizeof(double) * (m + features));
-  for (int j = 0; f->learned && j < RANK; ++j) { /* C = K^T */
-    const int n = j < first ? 0 : j < first + m + features ? j - first + 1 : m + features;
-    f->T[k][j] = dot(f->learned->root + (long)j * (j + 1) / 2 + first, functions, n);
-  }
-  if (f->learned) return;
-#endif
-  root_row(C, functions, m + features, first, f->T[k]);
+  } else
+    memcpy(white, V, sizeof(double) * (kept = m));
+  memcpy(white + kept, V + m, sizeof(double) * features);
 }
 
 /* HELPERS: each is included only if a prior uses it */
@@ -525,6 +508,12 @@ static void read_mean(const affine *restrict z, const latent *restrict f, const 
               dot(z->B_N[a], force[CONSTRAINT], NQ) + dot(z->B_F[a], force[JOINT_FRICTION], NQ);
 }
 
+/* copy the lower triangle to the upper one */
+static void mirror(double *restrict C, int n) {
+  for (int a = 0; a < n; ++a)
+    for (int b = a + 1; b < n; ++b) C[a * n + b] = C[b * n + a];
+}
+
 /* W = B E, which maps the latent forces to quantities */
 static void operators(const affine *restrict z, const latent *restrict f, int size, double (*restrict W)[COMPONENTS]) {
   for (int a = 0; a < size; ++a)
@@ -544,30 +533,70 @@ static void contact_unknown(const affine *restrict z, const equations *restrict 
   for (int a = 0; a < size; ++a) p[a] = std * dot(z->B_z[a], at->sliding_jacobian[x], NQ);
 }
 
-/* W D W^T + W T T^T W^T with W = B E, plus the variance of unknown forces; 0 if a variance is below rounding error */
+/* root = W T, with the row T_k = V^T C of each component, whose first columns are zero */
+static void carry(const latent *restrict f, double (*restrict W)[COMPONENTS], int size, double (*restrict root)[RANK]) {
+  memset(root, 0, sizeof(double[RANK]) * size);
+  for (int k = 0; k < COMPONENTS; ++k) {
+    const double *restrict V = f->V + FUNCTION[k], *restrict row = ROOTS[k];
+    const int n = FUNCTION[k + 1] - FUNCTION[k], first = SIGN > 0.0 ? FUNCTION[k] : 0;
+    double T[RANK], factor = 1.0;
+    int used = 0;
+    for (int a = 0; a < size; ++a) used |= W[a][k] != 0.0;
+    if (!used || dot(V, V, n) == 0.0) continue;
+#if ONLINE
+    if (f->learned) { /* C = K^T */
+      for (int j = first; j < RANK; ++j)
+        T[j - first] = dot(f->learned->root + (long)j * (j + 1) / 2 + first, V, j - first < n ? j - first + 1 : n);
+      row = T;
+    }
+#endif
+    if (row != T && n == 1)
+      factor = V[0];
+    else if (row != T)
+      combine(row, V, n, RANK - first, T), row = T;
+    for (int a = 0; a < size; ++a) {
+      const double share = factor * W[a][k];
+      double *restrict to = root[a] + first;
+      for (int c = 0; share != 0.0 && c < RANK - first; ++c) to[c] += share * row[c];
+    }
+  }
+}
+
+/* the lower triangle of W D W^T + W T T^T W^T; 0 if a variance is below rounding error */
+static int learned_covariance(const latent *restrict f, double (*restrict W)[COMPONENTS], int size,
+                              double *restrict covariance) {
+  double root[SIZE_OF_ALL][RANK], scaled[COMPONENTS];
+  int resolved = 1;
+  carry(f, W, size, root);
+  for (int a = 0; a < size; ++a) {
+    double before = 0.0;
+    for (int k = 0; k < COMPONENTS; ++k) scaled[k] = W[a][k] * f->rest[k], before += W[a][k] * W[a][k] * f->prior[k];
+    for (int b = 0; b <= a; ++b)
+      covariance[a * size + b] = SIGN * dot(root[a], root[b], RANK) + dot(scaled, W[b], COMPONENTS);
+    if (covariance[a * size + a] < SMALLEST_FRACTION * before) resolved = 0;
+  }
+  return resolved;
+}
+
+/* that of W = B E, plus the variance of unknown forces */
 static int read_covariance(const affine *restrict z, const equations *restrict e, const latent *restrict f,
                            const double *restrict unknown, int size, double *restrict covariance) {
-  double root[SIZE_OF_ALL][RANK], W[SIZE_OF_ALL][COMPONENTS], scaled[COMPONENTS], p[SIZE_OF_ALL];
-  int resolved = 1;
+  double W[SIZE_OF_ALL][COMPONENTS], p[SIZE_OF_ALL];
+  int resolved;
   operators(z, f, size, W);
-  for (int a = 0; a < size; ++a) combine(&f->T[0][0], W[a], COMPONENTS, RANK, root[a]);
+  resolved = learned_covariance(f, W, size, covariance);
   for (int a = 0; a < size; ++a) {
-    double before = 0.0, carried[NQ];
-    for (int k = 0; k < COMPONENTS; ++k) scaled[k] = W[a][k] * f->rest[k], before += W[a][k] * W[a][k] * f->prior[k];
+    double carried[NQ];
     for (int j = 0; j < NQ; ++j) carried[j] = (z->B_Q[a][j] + z->B_F[a][j]) * unknown[j];
-    for (int b = 0; b <= a; ++b) {
-      const double learned = SIGN * dot(root[a], root[b], RANK) + dot(scaled, W[b], COMPONENTS);
-      if (a == b && learned < SMALLEST_FRACTION * before) resolved = 0;
-      covariance[a * size + b] = learned + dot(carried, z->B_Q[b], NQ) + dot(carried, z->B_F[b], NQ);
-    }
+    for (int b = 0; b <= a; ++b)
+      covariance[a * size + b] += dot(carried, z->B_Q[b], NQ) + dot(carried, z->B_F[b], NQ);
   }
   for (int k = 0; k < 3 * CONTACTS; ++k) {
     contact_unknown(z, e, k / 3, k % 3, size, p);
     for (int a = 0; a < size; ++a)
       for (int b = 0; b <= a; ++b) covariance[a * size + b] += p[a] * p[b];
   }
-  for (int a = 0; a < size; ++a)
-    for (int b = a + 1; b < size; ++b) covariance[a * size + b] = covariance[b * size + a];
+  mirror(covariance, size);
   return resolved;
 }
 
@@ -615,7 +644,7 @@ static int evaluate(const forcegp_learned *learned, const double *q, const doubl
   if (status) return status;
   distance(qd, tau, s->far);
   expected_force(&s->e, tau, s->prior_mean);
-  s->f.learned = learned, s->f.folded = NULL, s->f.functions = NULL;
+  s->f.learned = learned, s->f.folded = NULL;
 #if ONLINE
   if (learned) s->f.folded = learned->folded;
 #endif

@@ -128,6 +128,7 @@ class ExportedModel:
         wrench: the frame and components of an external wrench to estimate, or `None`.
         dtype: precision of the C code.
         never_closed: contacts that are never closed in the training data.
+        jacobians: whether to export Jacobians of the mean.
     """
 
     system: ConstrainedSystem
@@ -141,6 +142,12 @@ class ExportedModel:
     wrench: WrenchFrame | None = None
     dtype: torch.dtype = torch.float64
     never_closed: tuple[str, ...] = ()
+    jacobians: bool = True
+
+    @property
+    def reads_contacts(self) -> bool:
+        """Whether the code reads contact forces off accelerations, which single precision cannot resolve."""
+        return bool(self.system.contacts) and self.dtype == torch.float64
 
     @property
     def online(self) -> bool:

@@ -1,0 +1,252 @@
+/* ---- unknown forces w, from accelerations ----
+ *
+ * r = M qdd - E Q = J^T w + e with the prior w ~ N(0, W) and the covariance S = Cov e of the forces, the measured torques
+ * and qdd. By generalized least squares, Cov w = (J S^-1 J^T + W^-1)^-1 and E w = Cov w J S^-1 r. */
+
+/* K = G^-1 and V = K^T K = M^-1, with the lower Cholesky factor G of M = G G^T; 0 unless M is positive definite */
+static int inverse(const double *restrict M, int n, double *restrict K, double *restrict V) {
+  double G[MOST_UNKNOWNS * MOST_UNKNOWNS];
+  if (!inverse_factor(M, n, G, K)) return 0;
+  for (int i = 0; i < n; ++i)
+    for (int j = 0; j < n; ++j) {
+      V[i * n + j] = 0.0;
+      for (int k = i > j ? i : j; k < n; ++k) V[i * n + j] += K[k * n + i] * K[k * n + j];
+    }
+  return 1;
+}
+
+/* equations of motion and posterior of the forces at a state with measured accelerations */
+static int measured(const forcegp_learned *learned, const double *q, const double *qd, const double *tau, const double *qdd,
+                    const unsigned char *closed, const double *qdd_std, double *beyond, situation *s) {
+  int status;
+  for (int i = 0; i < NQ; ++i)
+    if (!isfinite(qdd[i]) || (qdd_std && !(qdd_std[i] >= 0.0 && isfinite(qdd_std[i])))) return FORCEGP_NOT_FINITE;
+  if ((status = evaluate(learned, q, qd, tau, closed, qdd, 1, s)) != 0) return status;
+  if (beyond) memcpy(beyond, s->far, sizeof s->far);
+  return 0;
+}
+
+/* mean m and covariance V of w = prior v in units of the prior, given the mean of the forces, their covariance S, and n
+ * rows of J. With S = L L^T, E v = (B B^T + 1)^-1 B L^-1 r with B = prior J L^-T */
+static int least_squares(const situation *s, const double *qd, const double *qdd, const double *qdd_std,
+                         const double *restrict force, double *restrict S, int n, double (*restrict J)[NQ],
+                         const double *restrict prior, double *restrict m, double *restrict V) {
+  double r[NQ], e[NQ], unknown[NQ], G[NQ * NQ], root[NQ * NQ], B[UNKNOWNS][NQ], pull[UNKNOWNS];
+  double precision[UNKNOWNS * UNKNOWNS], V_root[UNKNOWNS * UNKNOWNS];
+  unknown_forces(qd, s->far, 1, unknown);
+  for (int i = 0; i < NQ; ++i) {
+    r[i] = dot(s->e.M[i], qdd, NQ) - force[i], S[i * NQ + i] += unknown[i];
+    for (int k = 0; k < NQ; ++k) {
+      const double variance = qdd_std ? qdd_std[k] * qdd_std[k] : SENSOR_VARIANCE[0] ? SENSOR_VARIANCE[0][k] : 0.0;
+      for (int j = 0; j < NQ; ++j) S[i * NQ + j] += s->e.M[i][k] * variance * s->e.M[j][k];
+    }
+  }
+  if (!inverse_factor(S, NQ, G, root)) return 0;
+  for (int i = 0; i < NQ; ++i) e[i] = dot(root + i * NQ, r, i + 1);
+  for (int a = 0; a < n; ++a) {
+    for (int i = 0; i < NQ; ++i) B[a][i] = prior[a] * dot(root + i * NQ, J[a], i + 1);
+    pull[a] = dot(B[a], e, NQ);
+    for (int b = 0; b <= a; ++b) precision[a * n + b] = precision[b * n + a] = dot(B[a], B[b], NQ) + (a == b ? 1.0 : 0.0);
+  }
+  if (!inverse(precision, n, V_root, V)) return 0;
+  for (int a = 0; a < n; ++a) m[a] = dot(V + a * n, pull, n);
+  return 1;
+}
+
+#ifdef FORCEGP_WRENCH
+/* ---- the external wrench; multipliers of contacts are additional unknowns, with rows of A in J. Since moments may be small
+ * compared with forces, the result is a mixture of estimates with priors `LEVERS` times as wide, weighted by their
+ * evidence. ---- */
+
+/* mean and covariance C of the mixture, in units of the prior, given those for the widest prior: C_s^-1 = C^-1 + s^-2 - 1,
+ * m_s = C_s C^-1 m, weights |C_s|^1/2 / s exp(m_s^T C_s^-1 m_s / 2) */
+static int over_levers(double *restrict mean, double *restrict C) {
+  enum { K = FORCEGP_WRENCH };
+  double precision[K * K], root[K * K], pull[K], m[LEVER_COUNT][K], C_s[LEVER_COUNT][K * K], weight[LEVER_COUNT];
+  double most, total = 0.0;
+  if (!inverse(C, K, root, precision)) return 0;
+  for (int i = 0; i < K; ++i) pull[i] = dot(precision + i * K, mean, K);
+  for (int s = 0; s < LEVER_COUNT; ++s) {
+    double narrow[K * K];
+    memcpy(narrow, precision, sizeof narrow);
+    for (int i = 0; i < K; ++i) narrow[i * K + i] += 1.0 / (LEVERS[s][i] * LEVERS[s][i]) - 1.0;
+    if (!inverse(narrow, K, root, C_s[s])) return 0;
+    for (int i = 0; i < K; ++i) m[s][i] = dot(C_s[s] + i * K, pull, K);
+    weight[s] = 0.5 * dot(m[s], pull, K);
+    for (int i = 0; i < K; ++i) weight[s] += log(root[i * K + i]) - log(LEVERS[s][i]);
+  }
+  most = weight[0];
+  for (int s = 0; s < LEVER_COUNT; ++s) most = fmax(most, weight[s]);
+  for (int s = 0; s < LEVER_COUNT; ++s) weight[s] = exp(weight[s] - most), total += weight[s];
+  memset(mean, 0, sizeof(double) * K), memset(C, 0, sizeof(double) * K * K);
+  for (int s = 0; s < LEVER_COUNT; ++s)
+    for (int i = 0; i < K; ++i) mean[i] += weight[s] / total * m[s][i];
+  for (int s = 0; s < LEVER_COUNT; ++s)
+    for (int i = 0; i < K; ++i)
+      for (int j = 0; j < K; ++j)
+        C[i * K + j] += weight[s] / total * (C_s[s][i * K + j] + (m[s][i] - mean[i]) * (m[s][j] - mean[j]));
+  return 1;
+}
+
+static int external_wrench(const forcegp_learned *learned, const double *q, const double *qd, const double *tau,
+                           const double *qdd, const unsigned char *closed, const double *qdd_std, double *mean,
+                           double *covariance, double *beyond) {
+  enum { K = FORCEGP_WRENCH, N = K + ROWS };
+  situation s;
+  affine z;
+  double force[NQ], S[NQ * NQ], zero[NQ] = {0.0}, sine[NQ], cosine[NQ], J[N][NQ], m[N], V[N * N], C[K * K];
+  int status = measured(learned, q, qd, tau, qdd, closed, qdd_std, beyond, &s);
+  if (status) return status;
+  maps(&s.e, s.gain, FORCEGP_TOTAL_FORCE, &z);
+  read_mean(&z, &s.f, s.prior_mean, NQ, force);
+  if (!read_covariance(&z, &s.e, &s.f, zero, NQ, S)) return FORCEGP_UNRESOLVED;
+  for (int i = 0; i < NQ; ++i) sine[i] = sin(q[i]), cosine[i] = cos(q[i]);
+  wrench_jacobian(q, sine, cosine, J[0]);
+  if (ROWS > 0) memcpy(J[K], s.e.A, sizeof(double) * ROWS * NQ);
+  if (!least_squares(&s, qd, qdd, qdd_std, force, S, N, J, WRENCH_PRIOR, m, V)) return FORCEGP_UNRESOLVED;
+  for (int a = 0; a < K; ++a) memcpy(C + a * K, V + a * N, sizeof(double) * K);
+  if (!over_levers(m, C)) return FORCEGP_UNRESOLVED;
+  for (int a = 0; a < K; ++a) {
+    mean[a] = WRENCH_PRIOR[a] * m[a];
+    for (int b = 0; covariance && b < K; ++b) covariance[a * K + b] = WRENCH_PRIOR[a] * WRENCH_PRIOR[b] * C[a * K + b];
+  }
+  return all_finite(mean, K) && (!covariance || all_finite(covariance, K * K)) ? 0 : FORCEGP_OVERFLOW;
+}
+
+int forcegp_external_wrench(const forcegp_learned *learned, long count, const double *q, const double *qd, const double *tau,
+                            const double *qdd, const unsigned char *closed, const double *qdd_std, double *mean,
+                            double *covariance, double *beyond, double *jacobian) {
+  enum { K = FORCEGP_WRENCH };
+  int worst = 0;
+  for (long n = 0; n < count; ++n) {
+    const unsigned char *shut = closed ? closed + n * CONTACTS : NULL;
+    const double *given[4] = {q + n * NQ, qd + n * NQ, tau + n * NQ, qdd + n * NQ};
+    int status = external_wrench(learned, given[0], given[1], given[2], given[3], shut, qdd_std, mean + n * K,
+                          covariance ? covariance + n * K * K : NULL, beyond ? beyond + n * NQ : NULL);
+    for (int c = 0; jacobian && !status && c < 4 * NQ; ++c) { /* fourth-order differences */
+      static const double times[4] = {-2.0, -1.0, 1.0, 2.0}, weight[4] = {1.0 / 12.0, -2.0 / 3.0, 2.0 / 3.0, -1.0 / 12.0};
+      const double step = c < 2 * NQ ? STATE_STEP : FORCE_STEP;
+      double *column = jacobian + n * K * 4 * NQ + c;
+      for (int a = 0; a < K; ++a) column[a * 4 * NQ] = 0.0;
+      for (int t = 0; t < 4 && !status; ++t) {
+        double x[4][NQ], w[K];
+        for (int i = 0; i < 4; ++i) memcpy(x[i], given[i], sizeof x[i]);
+        x[c / NQ][c % NQ] += times[t] * step;
+        status = external_wrench(learned, x[0], x[1], x[2], x[3], shut, qdd_std, w, NULL, NULL);
+        for (int a = 0; a < K; ++a) column[a * 4 * NQ] += weight[t] / step * w[a];
+      }
+    }
+    worst = worst ? worst : status;
+  }
+  return worst;
+}
+#endif
+
+#if CONTACTS > 0
+/* ---- the forces F = lambda (n - mu s(v)) + F_z + u of closed contacts, with w = (lambda, y) and F_z + u = mean + t R y.
+ * Learned friction F_z belongs to the unknown forces here, not to those in S. ---- */
+
+/* eigenvalues `d` and the first eigenvector (c, s) of a symmetric 2 x 2 matrix; the second one is (-s, c) */
+static void axes_of(const double *restrict C, double *restrict d, double *restrict c, double *restrict s) {
+  const double turn = 0.5 * atan2(2.0 * C[2], C[0] - C[3]);
+  *c = cos(turn), *s = sin(turn);
+  d[0] = *c * *c * C[0] + 2.0 * *c * *s * C[2] + *s * *s * C[3];
+  d[1] = *s * *s * C[0] - 2.0 * *c * *s * C[2] + *c * *c * C[3];
+}
+
+/* m and D `(3, 3)` of the force F = m + D w of a contact */
+static void force_of_contact(const situation *s, int contact, double *restrict m, double (*restrict D)[3]) {
+  const touching *at = &s->e.contact[contact];
+  double B[2][NQ], W[2][COMPONENTS] = {{0.0}}, C[4], d[2], c, e, P[2][2], y[2] = {0.0, 0.0}, variance;
+  for (int t = 0; t < 2; ++t)
+    for (int j = 0; j < NQ; ++j) {
+      B[t][j] = 0.0;
+      for (int x = 0; x < 3; ++x) B[t][j] += at->tangent[t][x] * at->jacobian[x][j];
+    }
+  /* F_z = P B Q_z with P = (B B^T)^+ */
+  C[0] = dot(B[0], B[0], NQ), C[2] = dot(B[1], B[0], NQ), C[3] = dot(B[1], B[1], NQ);
+  axes_of(C, d, &c, &e);
+  for (int t = 0; t < 2; ++t) d[t] = d[t] > RANK_TOLERANCE * RANK_TOLERANCE * (C[0] + C[3]) ? 1.0 / d[t] : 0.0;
+  P[0][0] = c * c * d[0] + e * e * d[1], P[1][1] = e * e * d[0] + c * c * d[1], P[0][1] = P[1][0] = c * e * (d[0] - d[1]);
+  for (int k = 0; k < COMPONENTS; ++k) {
+    double pull[2];
+    if (OWNER[k] != contact) continue;
+    for (int t = 0; t < 2; ++t) pull[t] = dot(B[t], s->f.E[k], NQ);
+    for (int t = 0; t < 2; ++t) W[t][k] = P[t][0] * pull[0] + P[t][1] * pull[1], y[t] += W[t][k] * s->f.mean[k];
+  }
+  learned_covariance(&s->f, W, 2, C);
+  variance = dot(at->sliding, at->sliding, 3) / (TIP[contact][2] * TIP[contact][2]);
+  variance = TIP[contact][0] + TIP[contact][1] * exp(-variance);
+  C[0] += variance, C[3] += variance;
+  axes_of(C, d, &c, &e);
+  for (int t = 0; t < 2; ++t) d[t] = sqrt(fmax(d[t], LEAST_VARIANCE));
+  for (int x = 0; x < 3; ++x) {
+    const double *t = &at->tangent[0][x], *u = &at->tangent[1][x];
+    m[x] = *t * y[0] + *u * y[1], D[x][0] = at->normal[x];
+    D[x][1] = (*t * c + *u * e) * d[0], D[x][2] = (*u * c - *t * e) * d[1];
+  }
+#if COULOMB > 0
+  for (int f = 0; f < COULOMB; ++f) {
+    const double size = sqrt(dot(at->sliding, at->sliding, 3) + COULOMB_SMOOTHING[f] * COULOMB_SMOOTHING[f]);
+    for (int x = 0; COULOMB_CONTACT[f] == contact && x < 3; ++x) D[x][0] -= COULOMB_COEFFICIENT[f] * at->sliding[x] / size;
+  }
+#endif
+}
+
+static int contact_force(const forcegp_learned *learned, const double *q, const double *qd, const double *tau,
+                         const double *qdd, const unsigned char *closed, const double *qdd_std, double *mean,
+                         double *covariance, double *beyond) {
+  enum { K = 3 * CONTACTS };
+  situation s;
+  double force[NQ], S[NQ * NQ], W[NQ][COMPONENTS], D[CONTACTS][3][3], J[K][NQ], prior[K], m[K], V[K * K];
+  int owner[K], n = 0, status = measured(learned, q, qd, tau, qdd, closed, qdd_std, beyond, &s);
+  if (status) return status;
+  memcpy(force, s.prior_mean, sizeof force);
+  for (int k = 0; k < COMPONENTS; ++k)
+    for (int j = 0; j < NQ; ++j) {
+      W[j][k] = OWNER[k] < 0 ? s.f.E[k][j] : 0.0;
+      force[j] += W[j][k] * s.f.mean[k];
+    }
+  if (!learned_covariance(&s.f, W, NQ, S)) return FORCEGP_UNRESOLVED;
+  mirror(S, NQ);
+  memset(mean, 0, sizeof(double) * K);
+  if (covariance) memset(covariance, 0, sizeof(double) * K * K);
+  for (int c = 0; c < CONTACTS; ++c) {
+    const touching *at = &s.e.contact[c];
+    if (!s.e.closed[c]) continue;
+    force_of_contact(&s, c, mean + 3 * c, D[c]);
+    for (int j = 0; j < NQ; ++j)
+      for (int x = 0; x < 3; ++x) force[j] += at->jacobian[x][j] * mean[3 * c + x];
+    for (int i = 0; i < 3; ++i, ++n) { /* rows of D^T J */
+      for (int j = 0; j < NQ; ++j) J[n][j] = 0.0;
+      for (int x = 0; x < 3; ++x)
+        for (int j = 0; j < NQ; ++j) J[n][j] += D[c][x][i] * at->jacobian[x][j];
+      owner[n] = c, prior[n] = i ? 1.0 : NORMAL_STD;
+    }
+  }
+  if (!least_squares(&s, qd, qdd, qdd_std, force, S, n, J, prior, m, V)) return FORCEGP_UNRESOLVED;
+  for (int a = 0; a < n; ++a)
+    for (int x = 0; x < 3; ++x) { /* F = m + D prior v */
+      const double by_a = D[owner[a]][x][a % 3] * prior[a];
+      mean[3 * owner[a] + x] += by_a * m[a];
+      for (int b = 0; covariance && b < n; ++b)
+        for (int y = 0; y < 3; ++y)
+          covariance[(3 * owner[a] + x) * K + 3 * owner[b] + y] += by_a * V[a * n + b] * D[owner[b]][y][b % 3] * prior[b];
+    }
+  return all_finite(mean, K) && (!covariance || all_finite(covariance, K * K)) ? 0 : FORCEGP_OVERFLOW;
+}
+
+int forcegp_contact_force(const forcegp_learned *learned, long count, const double *q, const double *qd, const double *tau,
+                          const double *qdd, const unsigned char *closed, const double *qdd_std, double *mean,
+                          double *covariance, double *beyond) {
+  enum { K = 3 * CONTACTS };
+  int worst = 0;
+  for (long n = 0; n < count; ++n) {
+    const int status = contact_force(learned, q + n * NQ, qd + n * NQ, tau + n * NQ, qdd + n * NQ,
+                                     closed ? closed + n * CONTACTS : NULL, qdd_std, mean + n * K,
+                                     covariance ? covariance + n * K * K : NULL, beyond ? beyond + n * NQ : NULL);
+    worst = worst ? worst : status;
+  }
+  return worst;
+}
+#endif
