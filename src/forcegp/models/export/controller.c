@@ -48,20 +48,34 @@ typedef struct {
   double expected[NQ];                         /* force that learned terms are expected to have */
 } equations;
 
-/* the lower Cholesky factor G of M = G G^T `(n, n)`, and K = G^-1; returns 0 unless M is positive definite */
-static int inverse_factor(const double *restrict M, int n, double *restrict G, double *restrict K) {
-  for (int i = 0; i < n; ++i)
-    for (int j = 0; j <= i; ++j) {
-      double sum = M[i * n + j];
-      for (int k = 0; k < j; ++k) sum -= G[i * n + k] * G[j * n + k];
-      if (i == j && !(sum > 0.0)) return 0;
-      G[i * n + j] = i == j ? sqrt(sum) : sum / G[j * n + j];
+/* K = G^-1 `(n, n)` with the lower Cholesky factor G of M = G G^T, and V = K^T K = M^-1 unless it is NULL; returns 0 unless M
+ * is positive definite. Loops run along rows, so that compilers use vector registers */
+static int inverse(const double *restrict M, int n, double *restrict K, double *restrict V) {
+  double U[MOST_UNKNOWNS * MOST_UNKNOWNS]; /* G^T */
+  memcpy(U, M, sizeof(double) * n * n);
+  for (int k = 0; k < n; ++k) {
+    double *restrict pivot = U + k * n, *restrict row = K + k * n;
+    const double inverse_size = 1.0 / sqrt(pivot[k]);
+    if (!(pivot[k] > 0.0)) return 0;
+    for (int j = k; j < n; ++j) pivot[j] *= inverse_size;
+    for (int i = k + 1; i < n; ++i) {
+      double *restrict below = U + i * n;
+      const double share = pivot[i];
+      for (int j = i; j < n; ++j) below[j] -= share * pivot[j];
     }
-  for (int j = 0; j < n; ++j)
-    for (int i = 0; i < n; ++i) {
-      double sum = i == j ? 1.0 : 0.0;
-      for (int k = j; k < i; ++k) sum -= G[i * n + k] * K[k * n + j];
-      K[i * n + j] = i < j ? 0.0 : sum / G[i * n + i];
+    /* row k of K = (1 - sum of G_ki K_i) / G_kk */
+    for (int j = 0; j < n; ++j) row[j] = j == k ? 1.0 : 0.0;
+    for (int i = 0; i < k; ++i) {
+      const double *restrict above = K + i * n, share = U[i * n + k];
+      for (int j = 0; j <= i; ++j) row[j] -= share * above[j];
+    }
+    for (int j = 0; j <= k; ++j) row[j] *= inverse_size;
+  }
+  if (V) memset(V, 0, sizeof(double) * n * n);
+  for (int k = 0; V && k < n; ++k)
+    for (int i = 0; i <= k; ++i) {
+      const double *restrict row = K + k * n, share = row[i];
+      for (int j = 0; j <= k; ++j) V[i * n + j] += share * row[j];
     }
   return 1;
 }
@@ -123,7 +137,7 @@ static void motion_under(const equations *restrict e, const double *restrict Q, 
 
 static int assemble(const double *restrict q, const double *restrict qd, const double *restrict tau,
                     const unsigned char *restrict closed, equations *restrict e) {
-  double sine[NQ], cosine[NQ], out[MECHANICS], G[NQ * NQ], K[NQ * NQ], Q[NQ];
+  double sine[NQ], cosine[NQ], out[MECHANICS], K[NQ * NQ], Q[NQ];
   const double *next = out + NQ * NQ + 3 * NQ;
   (void)closed;
   for (int i = 0; i < NQ; ++i) sine[i] = sin(q[i]), cosine[i] = cos(q[i]);
@@ -137,13 +151,7 @@ static int assemble(const double *restrict q, const double *restrict qd, const d
   memcpy(e->phi, next, sizeof(double) * FEATURES), next += FEATURES;
   memcpy(e->expected, next, sizeof e->expected);
   for (int i = 0; i < NQ; ++i) Q[i] = e->Q_C[i] + e->Q_G[i] + e->Q_D[i] + TORQUE_SCALE[i] * tau[i];
-  if (!inverse_factor(&e->M[0][0], NQ, G, K)) return 0;
-  for (int i = 0; i < NQ; ++i)
-    for (int j = 0; j <= i; ++j) {
-      double sum = 0.0;
-      for (int k = i; k < NQ; ++k) sum += K[k * NQ + i] * K[k * NQ + j];
-      e->M_inv[i][j] = e->M_inv[j][i] = sum;
-    }
+  if (!inverse(&e->M[0][0], NQ, K, &e->M_inv[0][0])) return 0;
   memcpy(e->H, e->M_inv, sizeof e->H);
 #if CONTACTS > 0
   {
@@ -311,11 +319,11 @@ typedef struct {
  * features phi(x) */
 static void component(const double *restrict V, int m, int features, double variance, const double *restrict weights,
                       const double *restrict whitening, int kept, int spread, int k, latent *restrict f) {
-  const double more = dot(V + m, V + m, features);
+  const double more = SIGN > 0.0 ? 0.0 : dot(V + m, V + m, features);
   double *restrict white = f->V + FUNCTION[k];
   if (f->folded) weights = f->folded + FOLDED[k];
   f->mean[k] = dot(V, weights, m + features);
-  f->prior[k] = f->rest[k] = SIGN > 0.0 ? variance : variance + more; /* squares of features do not cancel */
+  f->prior[k] = f->rest[k] = variance + more; /* squares of features do not cancel */
   if (!spread) return;
   if (whitening) { /* D = k - |R^T k(Z, x)|^2, the residual variance given the support points */
     combine(whitening, V, m, kept, white);
@@ -514,12 +522,12 @@ static void mirror(double *restrict C, int n) {
     for (int b = a + 1; b < n; ++b) C[a * n + b] = C[b * n + a];
 }
 
-/* W = B E, which maps the latent forces to quantities */
-static void operators(const affine *restrict z, const latent *restrict f, int size, double (*restrict W)[COMPONENTS]) {
-  for (int a = 0; a < size; ++a)
-    for (int k = 0; k < COMPONENTS; ++k) {
+/* W^T for W = B E, which maps the latent forces to quantities, `(COMPONENTS, size)` */
+static void operators(const affine *restrict z, const latent *restrict f, int size, double *restrict W) {
+  for (int k = 0; k < COMPONENTS; ++k)
+    for (int a = 0; a < size; ++a) {
       const double *B = TARGET[k] == CONTACT ? z->B_z[a] : TARGET[k] == CONSTRAINT ? z->B_N[a] : z->B_Q[a];
-      W[a][k] = dot(B, f->E[k], NQ) + (IS_FRICTION[k] ? dot(z->B_F[a], f->E[k], NQ) : 0.0);
+      W[k * size + a] = dot(B, f->E[k], NQ) + (IS_FRICTION[k] ? dot(z->B_F[a], f->E[k], NQ) : 0.0);
     }
 }
 
@@ -533,55 +541,79 @@ static void contact_unknown(const affine *restrict z, const equations *restrict 
   for (int a = 0; a < size; ++a) p[a] = std * dot(z->B_z[a], at->sliding_jacobian[x], NQ);
 }
 
-/* root = W T, with the row T_k = V^T C of each component, whose first columns are zero */
-static void carry(const latent *restrict f, double (*restrict W)[COMPONENTS], int size, double (*restrict root)[RANK]) {
-  memset(root, 0, sizeof(double[RANK]) * size);
-  for (int k = 0; k < COMPONENTS; ++k) {
-    const double *restrict V = f->V + FUNCTION[k], *restrict row = ROOTS[k];
-    const int n = FUNCTION[k + 1] - FUNCTION[k], first = SIGN > 0.0 ? FUNCTION[k] : 0;
-    double T[RANK], factor = 1.0;
-    int used = 0;
-    for (int a = 0; a < size; ++a) used |= W[a][k] != 0.0;
-    if (!used || dot(V, V, n) == 0.0) continue;
-#if ONLINE
-    if (f->learned) { /* C = K^T */
-      for (int j = first; j < RANK; ++j)
-        T[j - first] = dot(f->learned->root + (long)j * (j + 1) / 2 + first, V, j - first < n ? j - first + 1 : n);
-      row = T;
-    }
-#endif
-    if (row != T && n == 1)
-      factor = V[0];
-    else if (row != T)
-      combine(row, V, n, RANK - first, T), row = T;
-    for (int a = 0; a < size; ++a) {
-      const double share = factor * W[a][k];
-      double *restrict to = root[a] + first;
-      for (int c = 0; share != 0.0 && c < RANK - first; ++c) to[c] += share * row[c];
-    }
+/* up to four rows of C from the column `start` on, each times V and W^T of its component, so that passes over `root` are few */
+typedef struct {
+  const double *row[4], *W[4];
+  double V[4];
+  int start, count;
+} pending;
+
+static void add_rows(pending *restrict p, int size, double (*restrict root)[WIDTH]) {
+  static const double none[WIDTH] = {0.0};
+  const double *restrict r[4];
+  for (int t = 0; t < 4; ++t) r[t] = t < p->count ? p->row[t] : none;
+  for (int a = 0; p->count && a < size; ++a) {
+    double by[4] = {0.0, 0.0, 0.0, 0.0}, *restrict to = root[a] + p->start;
+    for (int t = 0; t < p->count; ++t) by[t] = p->V[t] * p->W[t][a];
+    for (int c = 0; (by[0] != 0.0 || by[1] != 0.0 || by[2] != 0.0 || by[3] != 0.0) && c < WIDTH - p->start; ++c)
+      to[c] += by[0] * r[0][c] + by[1] * r[1][c] + by[2] * r[2][c] + by[3] * r[3][c];
   }
+  p->count = 0;
 }
 
-/* the lower triangle of W D W^T + W T T^T W^T; 0 if a variance is below rounding error */
-static int learned_covariance(const latent *restrict f, double (*restrict W)[COMPONENTS], int size,
-                              double *restrict covariance) {
-  double root[SIZE_OF_ALL][RANK], scaled[COMPONENTS];
+/* root = W T `(size, RANK)` for W^T `(COMPONENTS, size)`, with the row T_k = V^T C of each component. Rows of C are used directly
+ * for a component with one function, or with one nonzero entry of W */
+static void carry(const latent *restrict f, const double *restrict W, int size, double (*restrict root)[WIDTH]) {
+  pending rows;
+  rows.count = rows.start = 0;
+  memset(root, 0, sizeof(double[WIDTH]) * size);
+  for (int k = 0; k < COMPONENTS; ++k) {
+    const double *V = f->V + FUNCTION[k], *w = W + (long)k * size;
+    const int n = FUNCTION[k + 1] - FUNCTION[k], start = START(k);
+    double T[WIDTH];
+    int uses = 0, nonzero = 0, whole;
+    for (int a = 0; a < size; ++a) uses += w[a] != 0.0;
+    for (int i = 0; uses && i < n; ++i) nonzero |= V[i] != 0.0;
+    if (!nonzero) continue;
+    whole = f->learned || (n > 1 && uses > 1);
+    if (whole || n > 1 || start != rows.start) add_rows(&rows, size, root);
+    if (whole) combine(ROOTS[k], V, n, WIDTH - start, T);
+#if ONLINE
+    for (int j = FUNCTION[k], own = 1; f->learned && j < RANK; ++j, own += own < n) /* C = K^T */
+      T[j - start] = dot(f->learned->root + (long)j * (j + 1) / 2 + FUNCTION[k], V, own);
+#endif
+    for (int i = 0; i < (whole ? 1 : n); ++i) {
+      rows.row[rows.count] = whole ? T : ROOTS[k] + (long)i * (WIDTH - start);
+      rows.W[rows.count] = w, rows.V[rows.count] = whole ? 1.0 : V[i], rows.start = start;
+      if (++rows.count == 4 || whole) add_rows(&rows, size, root);
+    }
+    if (n > 1) add_rows(&rows, size, root);
+  }
+  add_rows(&rows, size, root);
+}
+
+/* the lower triangle of W D W^T + W T T^T W^T for W^T `(COMPONENTS, size)`; 0 if a variance is below rounding error */
+static int learned_covariance(const latent *restrict f, const double *restrict W, int size, double *restrict covariance) {
+  double root[SIZE_OF_ALL][WIDTH], before[SIZE_OF_ALL] = {0.0};
   int resolved = 1;
   carry(f, W, size, root);
-  for (int a = 0; a < size; ++a) {
-    double before = 0.0;
-    for (int k = 0; k < COMPONENTS; ++k) scaled[k] = W[a][k] * f->rest[k], before += W[a][k] * W[a][k] * f->prior[k];
-    for (int b = 0; b <= a; ++b)
-      covariance[a * size + b] = SIGN * dot(root[a], root[b], RANK) + dot(scaled, W[b], COMPONENTS);
-    if (covariance[a * size + a] < SMALLEST_FRACTION * before) resolved = 0;
+  for (int a = 0; a < size; ++a)
+    for (int b = 0; b <= a; ++b) covariance[a * size + b] = SIGN * dot(root[a], root[b], WIDTH);
+  for (int k = 0; k < COMPONENTS; ++k) {
+    const double *w = W + k * size;
+    for (int a = 0; (f->prior[k] != 0.0 || f->rest[k] != 0.0) && a < size; ++a) {
+      before[a] += w[a] * w[a] * f->prior[k];
+      for (int b = 0; b <= a; ++b) covariance[a * size + b] += w[a] * f->rest[k] * w[b];
+    }
   }
+  for (int a = 0; a < size; ++a) resolved &= !(covariance[a * size + a] < SMALLEST_FRACTION * before[a]);
   return resolved;
 }
 
 /* that of W = B E, plus the variance of unknown forces */
 static int read_covariance(const affine *restrict z, const equations *restrict e, const latent *restrict f,
                            const double *restrict unknown, int size, double *restrict covariance) {
-  double W[SIZE_OF_ALL][COMPONENTS], p[SIZE_OF_ALL];
+  double W[COMPONENTS * SIZE_OF_ALL], p[SIZE_OF_ALL];
   int resolved;
   operators(z, f, size, W);
   resolved = learned_covariance(f, W, size, covariance);

@@ -3,18 +3,6 @@
  * r = M qdd - E Q = J^T w + e with the prior w ~ N(0, W) and the covariance S = Cov e of the forces, the measured torques
  * and qdd. By generalized least squares, Cov w = (J S^-1 J^T + W^-1)^-1 and E w = Cov w J S^-1 r. */
 
-/* K = G^-1 and V = K^T K = M^-1, with the lower Cholesky factor G of M = G G^T; 0 unless M is positive definite */
-static int inverse(const double *restrict M, int n, double *restrict K, double *restrict V) {
-  double G[MOST_UNKNOWNS * MOST_UNKNOWNS];
-  if (!inverse_factor(M, n, G, K)) return 0;
-  for (int i = 0; i < n; ++i)
-    for (int j = 0; j < n; ++j) {
-      V[i * n + j] = 0.0;
-      for (int k = i > j ? i : j; k < n; ++k) V[i * n + j] += K[k * n + i] * K[k * n + j];
-    }
-  return 1;
-}
-
 /* equations of motion and posterior of the forces at a state with measured accelerations */
 static int measured(const forcegp_learned *learned, const double *q, const double *qd, const double *tau, const double *qdd,
                     const unsigned char *closed, const double *qdd_std, double *beyond, situation *s) {
@@ -31,17 +19,17 @@ static int measured(const forcegp_learned *learned, const double *q, const doubl
 static int least_squares(const situation *s, const double *qd, const double *qdd, const double *qdd_std,
                          const double *restrict force, double *restrict S, int n, double (*restrict J)[NQ],
                          const double *restrict prior, double *restrict m, double *restrict V) {
-  double r[NQ], e[NQ], unknown[NQ], G[NQ * NQ], root[NQ * NQ], B[UNKNOWNS][NQ], pull[UNKNOWNS];
+  double r[NQ], e[NQ], unknown[NQ], root[NQ * NQ], B[UNKNOWNS][NQ], pull[UNKNOWNS];
   double precision[UNKNOWNS * UNKNOWNS], V_root[UNKNOWNS * UNKNOWNS];
   unknown_forces(qd, s->far, 1, unknown);
   for (int i = 0; i < NQ; ++i) {
     r[i] = dot(s->e.M[i], qdd, NQ) - force[i], S[i * NQ + i] += unknown[i];
     for (int k = 0; k < NQ; ++k) {
       const double variance = qdd_std ? qdd_std[k] * qdd_std[k] : SENSOR_VARIANCE[0] ? SENSOR_VARIANCE[0][k] : 0.0;
-      for (int j = 0; j < NQ; ++j) S[i * NQ + j] += s->e.M[i][k] * variance * s->e.M[j][k];
+      for (int j = 0; j < NQ; ++j) S[i * NQ + j] += s->e.M[i][k] * variance * s->e.M[k][j];
     }
   }
-  if (!inverse_factor(S, NQ, G, root)) return 0;
+  if (!inverse(S, NQ, root, NULL)) return 0;
   for (int i = 0; i < NQ; ++i) e[i] = dot(root + i * NQ, r, i + 1);
   for (int a = 0; a < n; ++a) {
     for (int i = 0; i < NQ; ++i) B[a][i] = prior[a] * dot(root + i * NQ, J[a], i + 1);
@@ -154,16 +142,15 @@ static void axes_of(const double *restrict C, double *restrict d, double *restri
   d[1] = *s * *s * C[0] - 2.0 * *c * *s * C[2] + *c * *c * C[3];
 }
 
-/* m and D `(3, 3)` of the force F = m + D w of a contact */
-static void force_of_contact(const situation *s, int contact, double *restrict m, double (*restrict D)[3]) {
+/* W = P B E for the friction of a contact, which maps latent forces to F_z = t P B Q_z: B = t^T J and P = (B B^T)^+ */
+static void friction_of_contact(const situation *s, int contact, double (*restrict W)[2 * CONTACTS]) {
   const touching *at = &s->e.contact[contact];
-  double B[2][NQ], W[2][COMPONENTS] = {{0.0}}, C[4], d[2], c, e, P[2][2], y[2] = {0.0, 0.0}, variance;
+  double B[2][NQ], C[4], d[2], c, e, P[2][2];
   for (int t = 0; t < 2; ++t)
     for (int j = 0; j < NQ; ++j) {
       B[t][j] = 0.0;
       for (int x = 0; x < 3; ++x) B[t][j] += at->tangent[t][x] * at->jacobian[x][j];
     }
-  /* F_z = P B Q_z with P = (B B^T)^+ */
   C[0] = dot(B[0], B[0], NQ), C[2] = dot(B[1], B[0], NQ), C[3] = dot(B[1], B[1], NQ);
   axes_of(C, d, &c, &e);
   for (int t = 0; t < 2; ++t) d[t] = d[t] > RANK_TOLERANCE * RANK_TOLERANCE * (C[0] + C[3]) ? 1.0 / d[t] : 0.0;
@@ -172,18 +159,24 @@ static void force_of_contact(const situation *s, int contact, double *restrict m
     double pull[2];
     if (OWNER[k] != contact) continue;
     for (int t = 0; t < 2; ++t) pull[t] = dot(B[t], s->f.E[k], NQ);
-    for (int t = 0; t < 2; ++t) W[t][k] = P[t][0] * pull[0] + P[t][1] * pull[1], y[t] += W[t][k] * s->f.mean[k];
+    for (int t = 0; t < 2; ++t) W[k][2 * contact + t] = P[t][0] * pull[0] + P[t][1] * pull[1];
   }
-  learned_covariance(&s->f, W, 2, C);
-  variance = dot(at->sliding, at->sliding, 3) / (TIP[contact][2] * TIP[contact][2]);
-  variance = TIP[contact][0] + TIP[contact][1] * exp(-variance);
-  C[0] += variance, C[3] += variance;
+}
+
+/* m and D `(3, 3)` of the force F = m + D w of a contact, given the mean y and the covariance `friction` of F_z */
+static void force_of_contact(const situation *s, int contact, const double *restrict y, const double *restrict friction,
+                             double *restrict m, double (*restrict D)[3]) {
+  enum { N = 2 * CONTACTS };
+  const touching *at = &s->e.contact[contact];
+  const double slow = dot(at->sliding, at->sliding, 3) / (TIP[contact][2] * TIP[contact][2]);
+  const double variance = TIP[contact][0] + TIP[contact][1] * exp(-slow);
+  double C[4] = {friction[0] + variance, 0.0, friction[N], friction[N + 1] + variance}, d[2], c, e;
   axes_of(C, d, &c, &e);
   for (int t = 0; t < 2; ++t) d[t] = sqrt(fmax(d[t], LEAST_VARIANCE));
   for (int x = 0; x < 3; ++x) {
-    const double *t = &at->tangent[0][x], *u = &at->tangent[1][x];
-    m[x] = *t * y[0] + *u * y[1], D[x][0] = at->normal[x];
-    D[x][1] = (*t * c + *u * e) * d[0], D[x][2] = (*u * c - *t * e) * d[1];
+    const double t = at->tangent[0][x], u = at->tangent[1][x];
+    m[x] = t * y[0] + u * y[1], D[x][0] = at->normal[x];
+    D[x][1] = (t * c + u * e) * d[0], D[x][2] = (u * c - t * e) * d[1];
   }
 #if COULOMB > 0
   for (int f = 0; f < COULOMB; ++f) {
@@ -198,23 +191,28 @@ static int contact_force(const forcegp_learned *learned, const double *q, const 
                          double *covariance, double *beyond) {
   enum { K = 3 * CONTACTS };
   situation s;
-  double force[NQ], S[NQ * NQ], W[NQ][COMPONENTS], D[CONTACTS][3][3], J[K][NQ], prior[K], m[K], V[K * K];
+  double force[NQ], S[NQ * NQ], W[COMPONENTS][2 * CONTACTS], friction[4 * CONTACTS * CONTACTS], y[2 * CONTACTS] = {0.0};
+  double D[CONTACTS][3][3], J[K][NQ], prior[K], m[K], V[K * K];
   int owner[K], n = 0, status = measured(learned, q, qd, tau, qdd, closed, qdd_std, beyond, &s);
   if (status) return status;
+  memset(W, 0, sizeof W);
+  for (int c = 0; c < CONTACTS; ++c)
+    if (s.e.closed[c]) friction_of_contact(&s, c, W);
+  learned_covariance(&s.f, W[0], 2 * CONTACTS, friction);
   memcpy(force, s.prior_mean, sizeof force);
-  for (int k = 0; k < COMPONENTS; ++k)
-    for (int j = 0; j < NQ; ++j) {
-      W[j][k] = OWNER[k] < 0 ? s.f.E[k][j] : 0.0;
-      force[j] += W[j][k] * s.f.mean[k];
-    }
-  if (!learned_covariance(&s.f, W, NQ, S)) return FORCEGP_UNRESOLVED;
+  for (int k = 0; k < COMPONENTS; ++k) {
+    for (int t = 0; OWNER[k] >= 0 && t < 2; ++t) y[2 * OWNER[k] + t] += W[k][2 * OWNER[k] + t] * s.f.mean[k];
+    if (OWNER[k] >= 0) memset(s.f.E[k], 0, sizeof s.f.E[k]);
+    for (int j = 0; j < NQ; ++j) force[j] += s.f.E[k][j] * s.f.mean[k];
+  }
+  if (!learned_covariance(&s.f, s.f.E[0], NQ, S)) return FORCEGP_UNRESOLVED;
   mirror(S, NQ);
   memset(mean, 0, sizeof(double) * K);
   if (covariance) memset(covariance, 0, sizeof(double) * K * K);
   for (int c = 0; c < CONTACTS; ++c) {
     const touching *at = &s.e.contact[c];
     if (!s.e.closed[c]) continue;
-    force_of_contact(&s, c, mean + 3 * c, D[c]);
+    force_of_contact(&s, c, y + 2 * c, friction + 2 * c * (2 * CONTACTS + 1), mean + 3 * c, D[c]);
     for (int j = 0; j < NQ; ++j)
       for (int x = 0; x < 3; ++x) force[j] += at->jacobian[x][j] * mean[3 * c + x];
     for (int i = 0; i < 3; ++i, ++n) { /* rows of D^T J */

@@ -50,6 +50,8 @@ READ = tuple(PREDICTED)
 """Quantities of the C code, in the order of their bits."""
 STEPS = 2e-5, 1e-3
 """Steps of fourth-order differences in q and q̇, and in τ and q̈. Friction changes within 0.01 rad/s."""
+LANES = 8
+"""Numbers in the widest vector registers."""
 TARGETS = (JOINT, CONTACT, CONSTRAINT)
 GIVEN = """const double *restrict q, const double *restrict qd, const double *restrict tau,
     const equations *restrict e, const double *restrict gain, int spread, latent *restrict f"""
@@ -174,6 +176,7 @@ class Writer:
         self.mean, self._tables = LearnedMotion(model, self.parts, differentiate=True), dict[str, str]()
         self.starts = list(accumulate((part.components for part in self.parts), initial=0))
         self.tables: list[list[str]] = []
+        self.width = -(-self.parts[0].rank // LANES) * LANES
         self._constants()
         self._noise()
         self._online()
@@ -206,10 +209,13 @@ class Writer:
             "SOME(n)": "((n) > 0 ? (n) : 1)",
             "COMPONENTS": self.starts[-1],
             "RANK": self.parts[0].rank,
+            "WIDTH": self.width,
+            "START(k)": f"({'FUNCTION[k]' if self.model.sign > 0 else '0'} / {LANES} * {LANES})",
             "FUNCTIONS": sum(len(C) for part in self.parts for C in part.roots),
             "MOST_FUNCTIONS": max(part.weights.shape[1] for part in self.parts),
             "SIGN": f"({self.model.sign}.0)",
             "QUANTITIES": len(READ),
+            "MOST_UNKNOWNS": max(robot.nq, 3 * len(contacts), 6 + len(contacts)),
             "SIZE_OF_ALL": sum(sizes),
             "COULOMB": len(process.coulomb),
             "INPUTS": sum(x.size for x in self.mean.x),
@@ -313,8 +319,7 @@ class Writer:
             return
         k = 0 if frame is None else len(frame.axes)
         unknowns = max(k + len(names) if k else 0, 3 * len(names))
-        most = max(unknowns, self.model.system.robot.nq)
-        self.lines.append(f"enum {{ UNKNOWNS = {unknowns}, MOST_UNKNOWNS = {most} }};")
+        self.lines.append(f"enum {{ UNKNOWNS = {unknowns} }};")
         if frame is not None:
             self.array([*frame.prior.tolist(), *len(names) * [MULTIPLIER_STD]], "WRENCH_PRIOR")
             self.array(torch.stack(frame.levers), "LEVERS")
@@ -431,7 +436,10 @@ class Writer:
             white, kept = "0", 0
             if part.whitening is not None and m:
                 white, kept = self.array(part.whitening[k].flatten()), part.whitening[k].shape[1]
-            tables = [self.array(part.weights[k]), white, str(kept), self.array(part.roots[k].flatten())]
+            # Rows of C begin and end at multiples of `LANES`.
+            padding = part.first[k] % LANES, self.width - part.rank
+            root = torch.nn.functional.pad(part.roots[k], padding)
+            tables = [self.array(part.weights[k]), white, str(kept), self.array(root.flatten())]
             self.tables.append(tables)
             rest = f"{', '.join(tables[:3])}, spread, {self.starts[p] + k}, f"
             lines.append(f"    component(V, {m}, {len(phi)}, {variance}, {rest});\n  }}")
