@@ -331,6 +331,7 @@ static void component(const double *restrict V, int m, int features, double vari
   } else
     memcpy(white, V, sizeof(double) * (kept = m));
   memcpy(white + kept, V + m, sizeof(double) * features);
+  if (INDEPENDENT[k] && !f->learned) f->rest[k] += dot(white, white, kept + features);
 }
 
 /* HELPERS: each is included only if a prior uses it */
@@ -548,62 +549,86 @@ typedef struct {
   int start, count;
 } pending;
 
-static void add_rows(pending *restrict p, int size, double (*restrict root)[WIDTH]) {
-  static const double none[WIDTH] = {0.0};
-  const double *restrict r[4];
-  for (int t = 0; t < 4; ++t) r[t] = t < p->count ? p->row[t] : none;
-  for (int a = 0; p->count && a < size; ++a) {
-    double by[4] = {0.0, 0.0, 0.0, 0.0}, *restrict to = root[a] + p->start;
-    for (int t = 0; t < p->count; ++t) by[t] = p->V[t] * p->W[t][a];
-    for (int c = 0; (by[0] != 0.0 || by[1] != 0.0 || by[2] != 0.0 || by[3] != 0.0) && c < WIDTH - p->start; ++c)
-      to[c] += by[0] * r[0][c] + by[1] * r[1][c] + by[2] * r[2][c] + by[3] * r[3][c];
+/* to += sum of by_t r_t for n numbers, a multiple of LANES */
+static void add_four(int n, double by0, double by1, double by2, double by3, const double *restrict r0,
+                     const double *restrict r1, const double *restrict r2, const double *restrict r3, double *restrict to) {
+  for (int c = 0; c < n; c += LANES)
+    for (int lane = c; lane < c + LANES; ++lane) to[lane] += by0 * r0[lane] + by1 * r1[lane] + by2 * r2[lane] + by3 * r3[lane];
+}
+
+static void add_rows(pending *restrict p, int size, int width, double (*restrict root)[PADDED]) {
+  static const double none[PADDED + SIZE_OF_ALL] = {0.0};
+  const int count = p->count, start = p->start;
+  if (count == 0) return;
+  for (int t = count; t < 4; ++t) p->row[t] = p->W[t] = none, p->V[t] = 0.0;
+  for (int a = 0; a < size; ++a) {
+    const double w0 = p->W[0][a], w1 = p->W[1][a], w2 = p->W[2][a], w3 = p->W[3][a];
+    if (w0 != 0.0 || w1 != 0.0 || w2 != 0.0 || w3 != 0.0)
+      add_four(width - start, p->V[0] * w0, p->V[1] * w1, p->V[2] * w2, p->V[3] * w3, p->row[0], p->row[1], p->row[2],
+               p->row[3], root[a] + start);
   }
   p->count = 0;
 }
 
 /* root = W T `(size, RANK)` for W^T `(COMPONENTS, size)`, with the row T_k = V^T C of each component. Rows of C are used directly
- * for a component with one function, or with one nonzero entry of W */
-static void carry(const latent *restrict f, const double *restrict W, int size, double (*restrict root)[WIDTH]) {
+ * for a component with one function, or with one nonzero entry of W. Returns the number of columns,
+ * and the number of nonzero entries of W for each component */
+static int carry(const latent *restrict f, const double *restrict W, int size, double (*restrict root)[PADDED],
+                 int *restrict uses) {
   pending rows;
+  const int width = f->learned ? PADDED : WIDTH;
   rows.count = rows.start = 0;
-  memset(root, 0, sizeof(double[WIDTH]) * size);
+  for (int a = 0; a < size; ++a) memset(root[a], 0, sizeof(double) * width);
   for (int k = 0; k < COMPONENTS; ++k) {
     const double *V = f->V + FUNCTION[k], *w = W + (long)k * size;
-    const int n = FUNCTION[k + 1] - FUNCTION[k], start = START(k);
-    double T[WIDTH];
-    int uses = 0, nonzero = 0, whole;
-    for (int a = 0; a < size; ++a) uses += w[a] != 0.0;
-    for (int i = 0; uses && i < n; ++i) nonzero |= V[i] != 0.0;
-    if (!nonzero) continue;
-    whole = f->learned || (n > 1 && uses > 1);
-    if (whole || n > 1 || start != rows.start) add_rows(&rows, size, root);
-    if (whole) combine(ROOTS[k], V, n, WIDTH - start, T);
+    const int n = FUNCTION[k + 1] - FUNCTION[k], start = f->learned ? FUNCTION[k] / LANES * LANES : START(k);
+    double T[PADDED];
+    int nonzero = 0, whole;
+    uses[k] = 0;
+    for (int a = 0; a < size; ++a) uses[k] += w[a] != 0.0;
+    for (int i = 0; uses[k] && i < n; ++i) nonzero |= V[i] != 0.0;
+    if (!nonzero || (INDEPENDENT[k] && !f->learned)) continue;
+    whole = f->learned || (n > 1 && uses[k] > 1);
+    if (whole || n > 1 || start != rows.start) add_rows(&rows, size, width, root);
+    if (whole && !f->learned) combine(ROOTS[k], V, n, width - start, T);
 #if ONLINE
+    if (f->learned) memset(T, 0, sizeof T);
     for (int j = FUNCTION[k], own = 1; f->learned && j < RANK; ++j, own += own < n) /* C = K^T */
       T[j - start] = dot(f->learned->root + (long)j * (j + 1) / 2 + FUNCTION[k], V, own);
 #endif
     for (int i = 0; i < (whole ? 1 : n); ++i) {
-      rows.row[rows.count] = whole ? T : ROOTS[k] + (long)i * (WIDTH - start);
+      rows.row[rows.count] = whole ? T : ROOTS[k] + (long)i * (width - start);
       rows.W[rows.count] = w, rows.V[rows.count] = whole ? 1.0 : V[i], rows.start = start;
-      if (++rows.count == 4 || whole) add_rows(&rows, size, root);
+      if (++rows.count == 4 || whole) add_rows(&rows, size, width, root);
     }
-    if (n > 1) add_rows(&rows, size, root);
+    if (n > 1) add_rows(&rows, size, width, root);
   }
-  add_rows(&rows, size, root);
+  add_rows(&rows, size, width, root);
+  return width;
+}
+
+/* a^T b for n numbers, a multiple of LANES */
+static double wide_dot(const double *restrict a, const double *restrict b, int n) {
+  double lanes[LANES] = {0.0}, sum = 0.0;
+  for (int c = 0; c < n; c += LANES)
+    for (int lane = 0; lane < LANES; ++lane) lanes[lane] += a[c + lane] * b[c + lane];
+  for (int lane = 0; lane < LANES; ++lane) sum += lanes[lane];
+  return sum;
 }
 
 /* the lower triangle of W D W^T + W T T^T W^T for W^T `(COMPONENTS, size)`; 0 if a variance is below rounding error */
 static int learned_covariance(const latent *restrict f, const double *restrict W, int size, double *restrict covariance) {
-  double root[SIZE_OF_ALL][WIDTH], before[SIZE_OF_ALL] = {0.0};
-  int resolved = 1;
-  carry(f, W, size, root);
+  double root[SIZE_OF_ALL][PADDED], before[SIZE_OF_ALL] = {0.0};
+  int uses[COMPONENTS], resolved = 1;
+  const int width = carry(f, W, size, root, uses);
   for (int a = 0; a < size; ++a)
-    for (int b = 0; b <= a; ++b) covariance[a * size + b] = SIGN * dot(root[a], root[b], WIDTH);
+    for (int b = 0; b <= a; ++b) covariance[a * size + b] = SIGN * wide_dot(root[a], root[b], width);
   for (int k = 0; k < COMPONENTS; ++k) {
-    const double *w = W + k * size;
-    for (int a = 0; (f->prior[k] != 0.0 || f->rest[k] != 0.0) && a < size; ++a) {
+    const double *w = W + (long)k * size;
+    if (!uses[k] || (f->prior[k] == 0.0 && f->rest[k] == 0.0)) continue;
+    for (int a = 0; a < size; ++a) {
       before[a] += w[a] * w[a] * f->prior[k];
-      for (int b = 0; b <= a; ++b) covariance[a * size + b] += w[a] * f->rest[k] * w[b];
+      for (int b = 0; w[a] != 0.0 && b <= a; ++b) covariance[a * size + b] += w[a] * f->rest[k] * w[b];
     }
   }
   for (int a = 0; a < size; ++a) resolved &= !(covariance[a * size + a] < SMALLEST_FRACTION * before[a]);

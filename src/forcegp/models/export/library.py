@@ -16,8 +16,8 @@ from torch import Tensor
 from forcegp.constraints import ConstrainedSystem
 from forcegp.errors import ForceGPError, ModelError, NumericalError, ShapeError, check_name
 from forcegp.forces.posterior import LOW
-from forcegp.forces.unknowns import AXES
 from forcegp.forces.quantities import FlatStates, ForceField, ForceLinearization, flat_states, hidden_forces
+from forcegp.forces.unknowns import AXES
 from forcegp.models.export.mean import DIFFERENTIATED
 from forcegp.models.export.model import ExportedModel
 from forcegp.models.export.source import READ, c_source

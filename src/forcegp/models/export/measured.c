@@ -203,7 +203,7 @@ static int contact_force(const forcegp_learned *learned, const double *q, const 
   for (int k = 0; k < COMPONENTS; ++k) {
     for (int t = 0; OWNER[k] >= 0 && t < 2; ++t) y[2 * OWNER[k] + t] += W[k][2 * OWNER[k] + t] * s.f.mean[k];
     if (OWNER[k] >= 0) memset(s.f.E[k], 0, sizeof s.f.E[k]);
-    for (int j = 0; j < NQ; ++j) force[j] += s.f.E[k][j] * s.f.mean[k];
+    for (int j = 0; s.f.mean[k] != 0.0 && j < NQ; ++j) force[j] += s.f.E[k][j] * s.f.mean[k];
   }
   if (!learned_covariance(&s.f, s.f.E[0], NQ, S)) return FORCEGP_UNRESOLVED;
   mirror(S, NQ);

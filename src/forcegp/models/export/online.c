@@ -28,9 +28,14 @@ void forcegp_begin(forcegp_learned *s) {
   memset(s, 0, sizeof *s);
   memcpy(s->weights, WEIGHTS, sizeof s->weights);
   for (int k = 0; k < COMPONENTS; ++k)
-    for (int i = FUNCTION[k]; i < FUNCTION[k + 1]; ++i)
-      for (int j = i; j < RANK; ++j)
-        s->root[(long)j * (j + 1) / 2 + i] = ROOTS[k][(long)(i - FUNCTION[k]) * (WIDTH - START(k)) + j - START(k)];
+    for (int i = FUNCTION[k]; i < FUNCTION[k + 1]; ++i) {
+      const double *row = INDEPENDENT[k] ? NULL : ROOTS[k] + (long)(i - FUNCTION[k]) * (WIDTH - START(k));
+      if (INDEPENDENT[k]) s->root[(long)i * (i + 1) / 2 + i] = 1.0;
+      for (int c = START(k); !INDEPENDENT[k] && c < COLUMNS; ++c) {
+        const long j = COLUMN[c];
+        if (j >= i) s->root[j * (j + 1) / 2 + i] = row[c - START(k)];
+      }
+    }
   fold(s);
 }
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from importlib.resources import files
 from itertools import accumulate
 from typing import NamedTuple
@@ -50,8 +50,8 @@ READ = tuple(PREDICTED)
 """Quantities of the C code, in the order of their bits."""
 STEPS = 2e-5, 1e-3
 """Steps of fourth-order differences in q and q̇, and in τ and q̈. Friction changes within 0.01 rad/s."""
-LANES = 8
-"""Numbers in the widest vector registers."""
+LANES = 16
+"""Numbers that a loop of the C code computes at a time: two of the widest vector registers."""
 TARGETS = (JOINT, CONTACT, CONSTRAINT)
 GIVEN = """const double *restrict q, const double *restrict qd, const double *restrict tau,
     const equations *restrict e, const double *restrict gain, int spread, latent *restrict f"""
@@ -166,6 +166,29 @@ def _programs(writer: Writer, rollout: bool) -> list[str]:
     return [f"#define MECHANICS {len(outputs)}", *(c_function(*item) for item in programs.items())]
 
 
+def _padded(count: int) -> int:
+    """Return the next multiple of `LANES`."""
+    return -(-count // LANES) * LANES
+
+
+def _touched(parts: Sequence[Functions], sign: int) -> tuple[list[bool], list[bool]]:
+    """Return whether data affect the functions of each component, and the columns of C that they fill.
+
+    The other components have C = 1, with zeros in the rows of other functions. The first one is always kept.
+    """
+    columns = [True] * parts[0].rank
+    pairs = [(C, first) for part in parts for C, first in zip(part.roots, part.first, strict=True)]
+    if sign < 0:
+        return [True] * len(pairs), columns
+    C = torch.cat([torch.nn.functional.pad(C, (first, 0)) for C, first in pairs])
+    alone = (torch.eye(len(C), dtype=C.dtype) != C).logical_not()
+    alone = alone.all(0) & alone.all(1)
+    touched = [i == 0 or not bool(alone[a : a + len(C)].all()) for i, (C, a) in enumerate(pairs)]
+    for (C, a), used in zip(pairs, touched, strict=True):
+        columns[a : a + len(C)] = [used] * len(C)
+    return touched, columns
+
+
 class Writer:
     """Writer of the code for the priors. `lines` contains the tables that this code reads."""
 
@@ -176,7 +199,9 @@ class Writer:
         self.mean, self._tables = LearnedMotion(model, self.parts, differentiate=True), dict[str, str]()
         self.starts = list(accumulate((part.components for part in self.parts), initial=0))
         self.tables: list[list[str]] = []
-        self.width = -(-self.parts[0].rank // LANES) * LANES
+        # Components whose functions the data do not affect are independent of all others.
+        self.touched, self.kept = _touched(self.parts, model.sign)
+        self.width = _padded(sum(self.kept))
         self._constants()
         self._noise()
         self._online()
@@ -210,7 +235,10 @@ class Writer:
             "COMPONENTS": self.starts[-1],
             "RANK": self.parts[0].rank,
             "WIDTH": self.width,
-            "START(k)": f"({'FUNCTION[k]' if self.model.sign > 0 else '0'} / {LANES} * {LANES})",
+            "COLUMNS": sum(self.kept),
+            "PADDED": _padded(self.parts[0].rank),
+            "LANES": LANES,
+            "START(k)": "(POSITION[k] / LANES * LANES)",
             "FUNCTIONS": sum(len(C) for part in self.parts for C in part.roots),
             "MOST_FUNCTIONS": max(part.weights.shape[1] for part in self.parts),
             "SIGN": f"({self.model.sign}.0)",
@@ -244,6 +272,9 @@ class Writer:
         self.array(accumulate((len(w) for x in self.parts for w in x.weights), initial=0), "FOLDED", "int")
         rows = [len(C) for part in self.parts for C in part.roots]
         self.array(accumulate(rows, initial=0), "FUNCTION", "int")
+        self.array([not kept for kept in self.touched], "INDEPENDENT", "int")
+        self.array([sum(self.kept[:i]) for part in self.parts for i in part.first], "POSITION", "int")
+        self.array([i for i, kept in enumerate(self.kept) if kept], "COLUMN", "int")
         owners = [part.prior for part in self.parts for _ in range(part.components)]
         self.array([TARGETS.index(prior.target) for prior in owners], "TARGET", "int")
         self.array([float(isinstance(prior, JointTerm)) for prior in owners], "IS_FRICTION", "int")
@@ -437,8 +468,11 @@ class Writer:
             if part.whitening is not None and m:
                 white, kept = self.array(part.whitening[k].flatten()), part.whitening[k].shape[1]
             # Rows of C begin and end at multiples of `LANES`.
-            padding = part.first[k] % LANES, self.width - part.rank
-            root = torch.nn.functional.pad(part.roots[k], padding)
+            root = torch.zeros(1)
+            if self.touched[self.starts[p] + k]:
+                filled, begin = torch.tensor(self.kept), part.first[k]
+                padding = sum(self.kept[:begin]) % LANES, self.width - sum(self.kept)
+                root = torch.nn.functional.pad(part.roots[k][:, filled[begin:]], padding)
             tables = [self.array(part.weights[k]), white, str(kept), self.array(root.flatten())]
             self.tables.append(tables)
             rest = f"{', '.join(tables[:3])}, spread, {self.starts[p] + k}, f"
