@@ -1,4 +1,4 @@
-"""The forces of contacts from accelerations in C: those of `contact_force`, on an arm and on a walking robot."""
+"""The forces of contacts from accelerations in C: those of `contact_force`, for an arm and a quadruped."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ LEGS = 1e-8
 
 
 def apart(ours: Prediction, theirs: Prediction) -> float:
-    """Largest difference of means over max(|mean|, σ), and of covariances over σ_i σ_j, of closed contacts."""
+    """Largest difference of means over max(|mean|, σ), and of covariances over σ_i σ_j."""
     assert ours.covariance is not None and theirs.covariance is not None and theirs.std is not None
     std = theirs.std.clamp(min=LEAST)
     mean = (ours.mean - theirs.mean).abs() / std.maximum(theirs.mean.abs())

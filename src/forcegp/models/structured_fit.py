@@ -385,7 +385,7 @@ class StructuredFit(FittedModel):
             functions: number of basis functions in a reduced-rank covariance, which is never smaller than the
                 full covariance. `None` uses all of them.
             wrench: the frame and components that `external_wrench` estimates.
-            jacobians: whether to compile `jacobian` and `linearize`, which can take a minute for a legged robot.
+            jacobians: whether to compile `jacobian` and `linearize`, a minute for a legged robot.
 
         Raises:
             ModelError: a prior, kernel or contact cannot be exported to C, or the posterior is too large.

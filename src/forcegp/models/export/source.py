@@ -274,7 +274,6 @@ class Writer:
         self.array(accumulate(rows, initial=0), "FUNCTION", "int")
         self.array([not kept for kept in self.touched], "INDEPENDENT", "int")
         self.array([sum(self.kept[:i]) for part in self.parts for i in part.first], "POSITION", "int")
-        self.array([i for i, kept in enumerate(self.kept) if kept], "COLUMN", "int")
         owners = [part.prior for part in self.parts for _ in range(part.components)]
         self.array([TARGETS.index(prior.target) for prior in owners], "TARGET", "int")
         self.array([float(isinstance(prior, JointTerm)) for prior in owners], "IS_FRICTION", "int")
@@ -335,6 +334,7 @@ class Writer:
         self.array(latent.joint_weights, "WEIGHTS")
         self.array([part.size for part in parts for _ in range(part.components)], "POINTS", "int")
         self.array(self.starts, "FIRST_COMPONENT", "int")
+        self.array([i for i, kept in enumerate(self.kept) if kept], "COLUMN", "int")
         self.array(variance, "LEARNED_TORQUE_VARIANCE")
         group = "CONTACTS * 3 > NQ ? CONTACTS * 3 : NQ"
         self.lines.append(
