@@ -6,8 +6,9 @@ static double dot(const double *restrict a, const double *restrict b, int n) {
   for (; i + 8 <= n; i += 8)
     for (int lane = 0; lane < 8; ++lane) lanes[lane] += a[i + lane] * b[i + lane];
   for (; i < n; ++i) sum += a[i] * b[i];
-  for (int lane = 0; lane < 8; ++lane) sum += lanes[lane];
-  return sum;
+  for (int half = 4; half > 0; half /= 2)
+    for (int lane = 0; lane < half; ++lane) lanes[lane] += lanes[lane + half];
+  return sum + lanes[0];
 }
 
 /* y = x^T C for C with n rows and m columns */
@@ -46,6 +47,7 @@ typedef struct {
   touching contact[SOME(CONTACTS)];
   double x[SOME(INPUTS)], phi[SOME(FEATURES)]; /* standardized inputs and features of the priors */
   double expected[NQ];                         /* force that learned terms are expected to have */
+  double pressing[SOME(ROWS)];                 /* lambda of known and expected forces with friction of contacts */
 } equations;
 
 /* K = G^-1 `(n, n)` with the lower Cholesky factor G of M = G G^T, and V = K^T K = M^-1 unless it is NULL; returns 0 unless M
@@ -233,6 +235,15 @@ static int friction_gain(const equations *e, double *restrict gain) {
     for (int r = 0; r < ROWS; ++r) gain[j * ROWS + r] = X[r][ROWS + j] / X[r][r];
   return 1;
 }
+
+static void pressing_forces(const double *restrict tau, const double *restrict gain, equations *restrict e) {
+  double Q[NQ], qdd[NQ], load[ROWS];
+  for (int j = 0; j < NQ; ++j)
+    Q[j] = e->Q_C[j] + e->Q_G[j] + e->Q_D[j] + TORQUE_SCALE[j] * tau[j] + e->expected[j];
+  motion_under(e, Q, qdd, load);
+  for (int j = 0; j < NQ; ++j) Q[j] += dot(gain + j * ROWS, load, ROWS);
+  motion_under(e, Q, qdd, e->pressing);
+}
 #endif
 
 /* ---- every quantity as an affine map of the forces: z = B_Q Q + B_z Q_z + B_N Q_N + B_F Q_F + o ---- */
@@ -392,20 +403,14 @@ static int against(const equations *restrict e, const double *restrict qd, int c
   return !loaded || relief > 0.0;
 }
 
-/* E = d(mu u)/d(log mu, log eps) lambda, with the multiplier under known and expected forces and this friction */
-static void friction_error(const equations *restrict e, const double *restrict tau, const double *restrict gain, int c,
-                           double mu, double smoothing, double (*restrict E)[NQ]) {
+/* E = d(mu u)/d(log mu, log eps) lambda */
+static void friction_error(const equations *restrict e, int c, double mu, double smoothing, double (*restrict E)[NQ]) {
   const touching *at = &e->contact[c];
   const double square = dot(at->sliding, at->sliding, 3), fading = smoothing * smoothing / (square + smoothing * smoothing);
-  double u[NQ], Q[NQ], qdd[NQ], load[SOME(ROWS)], multiplier[SOME(ROWS)];
+  double u[NQ];
   against_sliding(at, smoothing, u);
-  for (int j = 0; j < NQ; ++j)
-    Q[j] = e->Q_C[j] + e->Q_G[j] + e->Q_D[j] + TORQUE_SCALE[j] * tau[j] + e->expected[j];
-  motion_under(e, Q, qdd, load);
-  for (int j = 0; j < NQ; ++j) Q[j] += dot(gain + j * ROWS, load, ROWS);
-  motion_under(e, Q, qdd, multiplier);
   for (int j = 0; j < NQ; ++j) {
-    E[0][j] = e->closed[c] ? mu * multiplier[c] * u[j] : 0.0;
+    E[0][j] = e->closed[c] ? mu * e->pressing[c] * u[j] : 0.0;
     E[1][j] = -fading * E[0][j];
   }
 }
@@ -607,22 +612,31 @@ static int carry(const latent *restrict f, const double *restrict W, int size, d
   return width;
 }
 
-/* a^T b for n numbers, a multiple of LANES */
-static double wide_dot(const double *restrict a, const double *restrict b, int n) {
-  double lanes[LANES] = {0.0}, sum = 0.0;
+/* dots = a^T b for four rows b of n numbers, a multiple of LANES */
+static void four_dots(const double *restrict a, const double (*restrict b)[PADDED], int n, double *restrict dots) {
+  double lanes[4][LANES] = {{0.0}};
   for (int c = 0; c < n; c += LANES)
-    for (int lane = 0; lane < LANES; ++lane) lanes[lane] += a[c + lane] * b[c + lane];
-  for (int lane = 0; lane < LANES; ++lane) sum += lanes[lane];
-  return sum;
+    for (int row = 0; row < 4; ++row)
+      for (int lane = 0; lane < LANES; ++lane) lanes[row][lane] += a[c + lane] * b[row][c + lane];
+  for (int row = 0; row < 4; ++row) {
+    for (int half = LANES / 2; half > 0; half /= 2)
+      for (int lane = 0; lane < half; ++lane) lanes[row][lane] += lanes[row][lane + half];
+    dots[row] = lanes[row][0];
+  }
 }
 
 /* the lower triangle of W D W^T + W T T^T W^T for W^T `(COMPONENTS, size)`; 0 if a variance is below rounding error */
 static int learned_covariance(const latent *restrict f, const double *restrict W, int size, double *restrict covariance) {
-  double root[SIZE_OF_ALL][PADDED], before[SIZE_OF_ALL] = {0.0};
+  double root[SIZE_OF_ALL + 3][PADDED], before[SIZE_OF_ALL] = {0.0};
   int uses[COMPONENTS], resolved = 1;
   const int width = carry(f, W, size, root, uses);
+  for (int a = 0; a < 3; ++a) memset(root[size + a], 0, sizeof(double) * width);
   for (int a = 0; a < size; ++a)
-    for (int b = 0; b <= a; ++b) covariance[a * size + b] = SIGN * wide_dot(root[a], root[b], width);
+    for (int b = 0; b <= a; b += 4) {
+      double dots[4];
+      four_dots(root[a], root + b, width, dots);
+      for (int i = 0; i < 4 && b + i <= a; ++i) covariance[a * size + b + i] = SIGN * dots[i];
+    }
   for (int k = 0; k < COMPONENTS; ++k) {
     const double *w = W + (long)k * size;
     if (!uses[k] || (f->prior[k] == 0.0 && f->rest[k] == 0.0)) continue;
@@ -683,6 +697,7 @@ static int prepare(const double *q, const double *qd, const double *tau, const u
   if (!assemble(q, qd, tau, closed, e)) return FORCEGP_NO_INERTIA;
 #if COULOMB > 0
   if (!friction_gain(e, gain)) return FORCEGP_JAMMED;
+  pressing_forces(tau, gain, e);
 #endif
   return 0;
 }

@@ -17,24 +17,39 @@ static int measured(const forcegp_learned *learned, const double *q, const doubl
 /* mean m and covariance V of w = prior v in units of the prior, given the mean of the forces, their covariance S, and n
  * rows of J. With S = L L^T, E v = (B B^T + 1)^-1 B L^-1 r with B = prior J L^-T */
 static int least_squares(const situation *s, const double *qd, const double *qdd, const double *qdd_std,
-                         const double *restrict force, double *restrict S, int n, double (*restrict J)[NQ],
+                         const double *restrict force, const double *restrict S, int n, const double (*restrict J)[NQ],
                          const double *restrict prior, double *restrict m, double *restrict V) {
-  double r[NQ], e[NQ], unknown[NQ], root[NQ * NQ], B[UNKNOWNS][NQ], pull[UNKNOWNS];
-  double precision[UNKNOWNS * UNKNOWNS], V_root[UNKNOWNS * UNKNOWNS];
+  enum { MOST = NQ + UNKNOWNS + 1 };
+  const int rows = n + 1, width = NQ + rows;
+  double unknown[NQ], U[NQ][MOST], precision[UNKNOWNS * UNKNOWNS], pull[UNKNOWNS], V_root[UNKNOWNS * UNKNOWNS];
   unknown_forces(qd, s->far, 1, unknown);
+  /* U = [S, J^T prior, r] */
   for (int i = 0; i < NQ; ++i) {
-    r[i] = dot(s->e.M[i], qdd, NQ) - force[i], S[i * NQ + i] += unknown[i];
+    double by_noise[NQ], noise[NQ];
     for (int k = 0; k < NQ; ++k) {
       const double variance = qdd_std ? qdd_std[k] * qdd_std[k] : SENSOR_VARIANCE[0] ? SENSOR_VARIANCE[0][k] : 0.0;
-      for (int j = 0; j < NQ; ++j) S[i * NQ + j] += s->e.M[i][k] * variance * s->e.M[k][j];
+      by_noise[k] = s->e.M[i][k] * variance;
     }
+    combine(&s->e.M[0][0], by_noise, NQ, NQ, noise);
+    for (int j = 0; j < NQ; ++j) U[i][j] = S[i * NQ + j] + noise[j];
+    U[i][i] += unknown[i];
+    for (int a = 0; a < n; ++a) U[i][NQ + a] = prior[a] * J[a][i];
+    U[i][NQ + n] = dot(s->e.M[i], qdd, NQ) - force[i];
   }
-  if (!inverse(S, NQ, root, NULL)) return 0;
-  for (int i = 0; i < NQ; ++i) e[i] = dot(root + i * NQ, r, i + 1);
+  /* [L^T, B^T, L^-1 r] by elimination along rows */
+  for (int k = 0; k < NQ; ++k) {
+    const double inverse_size = 1.0 / sqrt(U[k][k]);
+    if (!(U[k][k] > 0.0)) return 0;
+    for (int j = k; j < width; ++j) U[k][j] *= inverse_size;
+    for (int i = k + 1; i < NQ; ++i)
+      for (int j = i; j < width; ++j) U[i][j] -= U[k][i] * U[k][j];
+  }
   for (int a = 0; a < n; ++a) {
-    for (int i = 0; i < NQ; ++i) B[a][i] = prior[a] * dot(root + i * NQ, J[a], i + 1);
-    pull[a] = dot(B[a], e, NQ);
-    for (int b = 0; b <= a; ++b) precision[a * n + b] = precision[b * n + a] = dot(B[a], B[b], NQ) + (a == b ? 1.0 : 0.0);
+    double sums[UNKNOWNS + 1] = {0.0};
+    for (int k = 0; k < NQ; ++k)
+      for (int b = a; b < rows; ++b) sums[b] += U[k][NQ + a] * U[k][NQ + b];
+    for (int b = a; b < n; ++b) precision[a * n + b] = sums[b] + (a == b ? 1.0 : 0.0);
+    pull[a] = sums[n];
   }
   if (!inverse(precision, n, V_root, V)) return 0;
   for (int a = 0; a < n; ++a) m[a] = dot(V + a * n, pull, n);

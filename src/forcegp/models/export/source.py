@@ -444,7 +444,7 @@ class Writer:
         if isinstance(prior, contact.CoulombErrorPrior):
             law = next(x for x in prior.friction if x.contact == prior.contact)
             numbers = f"{float(law.coefficient)!r}, {float(law.smoothing)!r}"
-            return [f"  friction_error(e, tau, gain, {c}, {numbers}, {E});"]
+            return [f"  friction_error(e, {c}, {numbers}, {E});"]
         if not isinstance(prior, contact.SlidingFrictionPrior):
             return [f"  tangential(e, {c}, {E});"]
         terms = self.array([contact.TERMS.index(term) for term in prior.terms], kind="int")
