@@ -468,14 +468,14 @@ static void matern52(double *restrict u, int m) {
 /* PRIORS */
 
 #if defined INERTIAL || defined PAYLOAD
-/* E = -[Y(q, qdd, qd), diag qdd] S for errors of inertial parameters of links, followed by those of drives */
-static void inertial(const double *restrict q, const double *restrict qd, const double *restrict qdd, int start, int column,
-                     int count, const double *restrict scale, latent *restrict f) {
+/* E = -[Y(q, qdd, qd), diag qdd] S in the given columns, for errors of inertial parameters of links and of drives */
+static void inertial(const double *restrict q, const double *restrict qd, const double *restrict qdd, int start, int count,
+                     const int *restrict column, const double *restrict units, latent *restrict f) {
   double sine[NQ], cosine[NQ], Y[10 * NQ + NQ][NQ] = {{0.0}};
   for (int i = 0; i < NQ; ++i) sine[i] = sin(q[i]), cosine[i] = cos(q[i]), Y[10 * NQ + i][i] = qdd[i];
   regressor(q, qd, qdd, sine, cosine, Y[0]);
   for (int k = 0; k < count; ++k)
-    for (int j = 0; j < NQ; ++j) f->E[start + k][j] = -scale[k] * Y[column + k][j];
+    for (int j = 0; j < NQ; ++j) f->E[start + k][j] = -units[k] * Y[column[k]][j];
 }
 #endif
 
@@ -497,10 +497,10 @@ static void inertial_errors(const double *q, const double *qd, const double *tau
   }
 #endif
 #ifdef PAYLOAD
-  inertial(q, qd, PAYLOAD_MEASURED && qdd ? qdd : e->qdd, PAYLOAD, PAYLOAD_COLUMN, 4, PAYLOAD_UNITS, f);
+  inertial(q, qd, PAYLOAD_MEASURED && qdd ? qdd : e->qdd, PAYLOAD, 4, PAYLOAD_COLUMN, PAYLOAD_UNITS, f);
 #endif
 #ifdef INERTIAL
-  inertial(q, qd, qdd ? qdd : e->qdd, INERTIAL, 0, INERTIAL_COLUMNS, INERTIAL_SCALE, f);
+  inertial(q, qd, qdd ? qdd : e->qdd, INERTIAL, INERTIAL_COUNT, INERTIAL_COLUMN, INERTIAL_UNITS, f);
 #endif
 }
 

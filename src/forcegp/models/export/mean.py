@@ -256,7 +256,11 @@ class Mean:
                 text = f"the columns of {prior.name!r} have no form in C and CasADi: {cause}"
                 expected = "arithmetic, abs, integer powers and the functions of forcegp.forces.term"
                 raise ModelError(text, expected=expected) from cause
-            return {name: list(column) for name, column in columns.items()}
+            if not prior.needs_drive:
+                return {name: list(column) for name, column in columns.items()}
+            driven = self.robot.driven.tolist()
+            zero = self.graph.constant(0.0)
+            return {name: [x if acts else zero for x, acts in zip(column, driven, strict=True)] for name, column in columns.items()}
         if isinstance(prior, contact.SurfaceForcePrior):
             at = self.touching[self.names.index(prior.contact)]
             square = at.sliding @ at.sliding
@@ -426,7 +430,8 @@ class LearnedMotion(Mean):
             if part.size:
                 first, slope = first + part.components, slope + part.components * self.x[p].shape[1]
             if isinstance(prior, InertialPrior):
-                errors = f * np.array(prior.scale(self.robot).tolist())
+                (columns, units), errors = part.inertial(self.robot), self.zeros((PARAMETERS + 1) * n)
+                errors[columns] = f * np.array(units.tolist())
                 links, drives = errors[: PARAMETERS * n].reshape(n, PARAMETERS), errors[PARAMETERS * n :]
                 Q = Q - self._inertial_force(links, drives)
             elif isinstance(prior, DrivePrior):

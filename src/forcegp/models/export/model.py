@@ -15,10 +15,11 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import accumulate
+from itertools import accumulate, pairwise
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from forcegp.constraints import ConstrainedSystem, Cylinder, Plane, Sphere, SurfaceContact
 from forcegp.errors import ModelError
@@ -45,6 +46,8 @@ from forcegp.gp.kernels import (
     sub,
 )
 from forcegp.gp.sparse import SparsePosterior
+from forcegp.identification import base_parameters
+from forcegp.robot.model import RobotModel
 
 PRIORS = (joint.JointForcePrior, ResidualPrior, InertialPrior, PayloadPrior, DrivePrior)
 PRIORS += (contact.NormalForcePrior, contact.SlidingFrictionPrior, contact.ContactForcePrior)
@@ -77,6 +80,7 @@ class Functions:
         whitening: a matrix `(m, kept)` that whitens k(x, X) for each component, or `None`.
         roots: the matrix C of each component, `(functions, rank − first)`.
         first: the first nonzero column for each component.
+        parameters: for errors of base parameters, their columns in [Y, diag q̈].
     """
 
     prior: ForcePrior
@@ -87,6 +91,7 @@ class Functions:
     whitening: tuple[Tensor, ...] | None
     roots: tuple[Tensor, ...]
     first: tuple[int, ...]
+    parameters: tuple[int, ...] = ()
 
     @property
     def components(self) -> int:
@@ -102,6 +107,14 @@ class Functions:
     def size(self) -> int:
         """Number m of support points."""
         return 0 if self.rest is None else points(self.support)
+
+    def inertial(self, robot: RobotModel) -> tuple[list[int], Tensor]:
+        """Return the columns of [Y, diag q̈] that errors of inertia multiply, and the units of the errors."""
+        if self.parameters:
+            return list(self.parameters), torch.ones(len(self.parameters), dtype=torch.float64)
+        assert isinstance(self.prior, InertialPrior)
+        units = self.prior.scale(robot)
+        return list(range(len(units))), units
 
     def columns(self, names: Sequence[str] | None) -> list[int]:
         """Return the columns of the named inputs, or of all inputs."""
@@ -222,6 +235,38 @@ class ExportedModel:
             return self._of_basis(self.posterior.latent)
         return self._of_rows(self.posterior.latent)
 
+    def parts_of_motion(self) -> list[Functions]:
+        """Functions of each prior, with errors of inertia replaced by those of the parameters that affect the motion.
+
+        The forces have the same posterior. If the sign of T Tᵀ is negative, D is diagonal only for errors of
+        all parameters, which are returned.
+        """
+        parts = self.parts()
+        p = next((p for p, part in enumerate(parts) if isinstance(part.prior, InertialPrior)), None)
+        if p is None or self.sign < 0:
+            return parts
+        B, parameters = _acting_errors(parts[p], self.system.robot)
+        C = torch.cat([pad(C, (x, 0)) for part in parts for C, x in zip(part.roots, part.first, strict=True)])
+        at = sum(len(C) for part in parts[:p] for C in part.roots)
+        C = torch.cat([C[:at], B @ C[at : at + B.shape[1]], C[at + B.shape[1] :]])
+        # C Cᵀ = R Rᵀ with an upper triangular R, whose rows keep their columns.
+        surplus = [at + k for k in range(B.shape[1]) if k not in parameters]
+        order = surplus + [i for i in range(C.shape[1]) if i not in surplus]
+        R = torch.linalg.qr(C[:, order].flip(0, 1).mT, mode="r").R.mT.flip(0, 1)
+        one = KernelPart(Constant(), {"log_scale": B.new_zeros(len(B))})
+        first, result = 0, []
+        for part in parts:
+            acts = part is parts[p]
+            sizes = len(B) * [1] if acts else [len(C) for C in part.roots]
+            starts = list(accumulate(sizes, initial=first))
+            roots = tuple(R[i:j, i:] for i, j in pairwise(starts))
+            part = dataclasses.replace(part, roots=roots, first=tuple(starts[:-1]))
+            if acts:
+                weights = B @ part.weights
+                part = dataclasses.replace(part, weights=weights, finite=one, parameters=parameters)
+            first, result = starts[-1], [*result, part]
+        return result
+
     def _of_basis(self, latent: SparsePosterior) -> list[Functions]:
         basis, parts = latent.basis, []
         if self.functions is None:
@@ -276,6 +321,19 @@ class ExportedModel:
             C, first = tuple(whole[..., 1:]), (0,) * len(whole)
             parts.append(Functions(prior, cut.rest, cut.finite, support, whole[..., 0], None, C, first))
         return parts
+
+
+def _acting_errors(part: Functions, robot: RobotModel) -> tuple[Tensor, tuple[int, ...]]:
+    """Return the matrix that maps the weights of errors of inertia to errors of base parameters and of drives.
+
+    The second value contains the columns of these parameters in [Y, diag q̈].
+    """
+    base, units = base_parameters(robot), part.inertial(robot)[1]
+    assert part.finite is not None and isinstance(part.finite.kernel, Constant)
+    links = base.combination.shape[1]
+    drives = links + units[links:].nonzero()[:, 0]
+    B = torch.cat([pad(torch.from_numpy(base.combination), (0, len(units) - links)), torch.eye(len(units))[drives]])
+    return B * units * part.finite.kernel.std(part.finite.params), (*base.columns, *drives.tolist())
 
 
 def row_of(x: Tensor, k: int) -> Tensor:

@@ -193,7 +193,9 @@ class Writer:
     """Writer of the code for the priors. `lines` contains the tables that this code reads."""
 
     def __init__(self, model: ExportedModel, rollout: bool) -> None:
-        self.model, self.parts, self.lines, self.rollout = model, model.parts(), list[str](), rollout
+        self.model, self.lines, self.rollout = model, list[str](), rollout
+        # Samples of functions are drawn for all inertial parameters.
+        self.parts = model.parts() if rollout else model.parts_of_motion()
         self.differentiates = model.jacobians and not rollout
         self.measures = not rollout and (model.wrench is not None or model.reads_contacts)
         self.mean, self._tables = LearnedMotion(model, self.parts, differentiate=True), dict[str, str]()
@@ -287,11 +289,13 @@ class Writer:
                 self.lines.append(f"#define DRIVES_MEASURED {int(part.prior.is_error)}")
             if isinstance(part.prior, InertialPrior):
                 self.lines.append(f"#define INERTIAL {start}")
-                self.lines.append(f"#define INERTIAL_COLUMNS {part.components}")
-                self.array(part.prior.scale(robot), "INERTIAL_SCALE")
+                self.lines.append(f"#define INERTIAL_COUNT {part.components}")
+                columns, units = part.inertial(robot)
+                self.array(columns, "INERTIAL_COLUMN", "int"), self.array(units, "INERTIAL_UNITS")
             if isinstance(part.prior, PayloadPrior):
-                column = PER_PAYLOAD * part.prior.link(robot)
-                self.lines += [f"#define PAYLOAD {start}", f"#define PAYLOAD_COLUMN {column}"]
+                self.lines.append(f"#define PAYLOAD {start}")
+                first = PER_PAYLOAD * part.prior.link(robot)
+                self.array(range(first, first + part.components), "PAYLOAD_COLUMN", "int")
                 self.lines.append(f"#define PAYLOAD_MEASURED {int(part.prior.measured)}")
                 self.array(part.prior.units(robot.mass), "PAYLOAD_UNITS")
         if process.coulomb:
