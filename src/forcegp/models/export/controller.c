@@ -379,6 +379,7 @@ static int against(const equations *restrict e, const double *restrict qd, int c
   const touching *at = &e->contact[c];
   const double square = dot(at->sliding, at->sliding, 3), size = sqrt(square + smoothing * smoothing);
   const double rate = dot(at->turning, qd, NQ), spin = sqrt(rate * rate + torsion_smoothing * torsion_smoothing);
+  const double fading = exp(-square / (stribeck_speed * stribeck_speed));
   double push[NQ], relief = 1.0, load;
   int loaded = 0;
   memset(E, 0, sizeof(double[NQ]) * count);
@@ -392,7 +393,7 @@ static int against(const equations *restrict e, const double *restrict qd, int c
   for (int k = 0; k < count; ++k) {
     loaded |= terms[k] >= COULOMBS;
     for (int j = 0; j < NQ; ++j) {
-      const double dry = push[j] / size, fading = exp(-square / (stribeck_speed * stribeck_speed));
+      const double dry = push[j] / size;
       E[k][j] = terms[k] == VISCOUS    ? push[j]
                 : terms[k] == DRY      ? dry
                 : terms[k] == COULOMBS ? load * dry

@@ -149,12 +149,12 @@ int forcegp_external_wrench(const forcegp_learned *learned, long count, const do
 /* ---- the forces F = lambda (n - mu s(v)) + F_z + u of closed contacts, with w = (lambda, y) and F_z + u = mean + t R y.
  * Learned friction F_z belongs to the unknown forces here, not to those in S. ---- */
 
-/* eigenvalues `d` and the first eigenvector (c, s) of a symmetric 2 x 2 matrix; the second one is (-s, c) */
+/* eigenvalues `d` and the first eigenvector (c, s) of a symmetric 2 x 2 matrix by a Jacobi rotation; the second one is (-s, c) */
 static void axes_of(const double *restrict C, double *restrict d, double *restrict c, double *restrict s) {
-  const double turn = 0.5 * atan2(2.0 * C[2], C[0] - C[3]);
-  *c = cos(turn), *s = sin(turn);
-  d[0] = *c * *c * C[0] + 2.0 * *c * *s * C[2] + *s * *s * C[3];
-  d[1] = *s * *s * C[0] - 2.0 * *c * *s * C[2] + *c * *c * C[3];
+  const double zeta = (C[0] - C[3]) / (2.0 * C[2]);
+  const double t = C[2] == 0.0 ? 0.0 : (zeta < 0.0 ? -1.0 : 1.0) / (fabs(zeta) + sqrt(1.0 + zeta * zeta));
+  *c = 1.0 / sqrt(1.0 + t * t), *s = *c * t;
+  d[0] = C[0] + t * C[2], d[1] = C[3] - t * C[2];
 }
 
 /* W = P B E for the friction of a contact, which maps latent forces to F_z = t P B Q_z: B = t^T J and P = (B B^T)^+ */
@@ -187,7 +187,7 @@ static void force_of_contact(const situation *s, int contact, const double *rest
   const double variance = TIP[contact][0] + TIP[contact][1] * exp(-slow);
   double C[4] = {friction[0] + variance, 0.0, friction[N], friction[N + 1] + variance}, d[2], c, e;
   axes_of(C, d, &c, &e);
-  for (int t = 0; t < 2; ++t) d[t] = sqrt(fmax(d[t], LEAST_VARIANCE));
+  for (int t = 0; t < 2; ++t) d[t] = sqrt(d[t] > LEAST_VARIANCE ? d[t] : LEAST_VARIANCE);
   for (int x = 0; x < 3; ++x) {
     const double t = at->tangent[0][x], u = at->tangent[1][x];
     m[x] = t * y[0] + u * y[1], D[x][0] = at->normal[x];
@@ -208,7 +208,7 @@ static int contact_force(const forcegp_learned *learned, const double *q, const 
   situation s;
   double force[NQ], S[NQ * NQ], W[COMPONENTS][2 * CONTACTS], friction[4 * CONTACTS * CONTACTS], y[2 * CONTACTS] = {0.0};
   double D[CONTACTS][3][3], J[K][NQ], prior[K], m[K], V[K * K];
-  int owner[K], n = 0, status = measured(learned, q, qd, tau, qdd, closed, qdd_std, beyond, &s);
+  int order[CONTACTS], n = 0, status = measured(learned, q, qd, tau, qdd, closed, qdd_std, beyond, &s);
   if (status) return status;
   memset(W, 0, sizeof W);
   for (int c = 0; c < CONTACTS; ++c)
@@ -227,24 +227,28 @@ static int contact_force(const forcegp_learned *learned, const double *q, const 
   for (int c = 0; c < CONTACTS; ++c) {
     const touching *at = &s.e.contact[c];
     if (!s.e.closed[c]) continue;
-    force_of_contact(&s, c, y + 2 * c, friction + 2 * c * (2 * CONTACTS + 1), mean + 3 * c, D[c]);
+    force_of_contact(&s, c, y + 2 * c, friction + 2 * c * (2 * CONTACTS + 1), mean + 3 * c, D[n]);
     for (int j = 0; j < NQ; ++j)
       for (int x = 0; x < 3; ++x) force[j] += at->jacobian[x][j] * mean[3 * c + x];
-    for (int i = 0; i < 3; ++i, ++n) { /* rows of D^T J */
-      for (int j = 0; j < NQ; ++j) J[n][j] = 0.0;
+    for (int i = 0; i < 3; ++i) { /* rows of D^T J */
+      prior[3 * n + i] = i ? 1.0 : NORMAL_STD;
+      for (int j = 0; j < NQ; ++j) J[3 * n + i][j] = 0.0;
       for (int x = 0; x < 3; ++x)
-        for (int j = 0; j < NQ; ++j) J[n][j] += D[c][x][i] * at->jacobian[x][j];
-      owner[n] = c, prior[n] = i ? 1.0 : NORMAL_STD;
+        for (int j = 0; j < NQ; ++j) J[3 * n + i][j] += D[n][x][i] * at->jacobian[x][j];
     }
+    order[n++] = c;
   }
-  if (!least_squares(&s, qd, qdd, qdd_std, force, S, n, J, prior, m, V)) return FORCEGP_UNRESOLVED;
-  for (int a = 0; a < n; ++a)
-    for (int x = 0; x < 3; ++x) { /* F = m + D prior v */
-      const double by_a = D[owner[a]][x][a % 3] * prior[a];
-      mean[3 * owner[a] + x] += by_a * m[a];
-      for (int b = 0; covariance && b < n; ++b)
-        for (int y = 0; y < 3; ++y)
-          covariance[(3 * owner[a] + x) * K + 3 * owner[b] + y] += by_a * V[a * n + b] * D[owner[b]][y][b % 3] * prior[b];
+  if (!least_squares(&s, qd, qdd, qdd_std, force, S, 3 * n, J, prior, m, V)) return FORCEGP_UNRESOLVED;
+  for (int k = 0; k < n; ++k) /* F = m + D prior v */
+    for (int x = 0; x < 3; ++x) {
+      double along[K] = {0.0}, D_prior[3];
+      for (int i = 0; i < 3; ++i) D_prior[i] = D[k][x][i] * prior[3 * k + i];
+      mean[3 * order[k] + x] += dot(D_prior, m + 3 * k, 3);
+      if (!covariance) continue;
+      for (int i = 0; i < 3; ++i)
+        for (int b = 0; b < 3 * n; ++b) along[b] += D_prior[i] * V[3 * (3 * k + i) * n + b] * prior[b];
+      for (int l = 0; l < n; ++l)
+        for (int i = 0; i < 3; ++i) covariance[(3 * order[k] + x) * K + 3 * order[l] + i] = dot(D[l][i], along + 3 * l, 3);
     }
   return all_finite(mean, K) && (!covariance || all_finite(covariance, K * K)) ? 0 : FORCEGP_OVERFLOW;
 }
