@@ -614,7 +614,7 @@ static int carry(const latent *restrict f, const double *restrict W, int size, d
 }
 
 /* dots = a^T b for four rows b of n numbers, a multiple of LANES */
-static void four_dots(const double *restrict a, const double (*restrict b)[PADDED], int n, double *restrict dots) {
+static void four_dots(const double *restrict a, double (*restrict b)[PADDED], int n, double *restrict dots) {
   double lanes[4][LANES] = {{0.0}};
   for (int c = 0; c < n; c += LANES)
     for (int row = 0; row < 4; ++row)

@@ -17,7 +17,7 @@ static int measured(const forcegp_learned *learned, const double *q, const doubl
 /* mean m and covariance V of w = prior v in units of the prior, given the mean of the forces, their covariance S, and n
  * rows of J. With S = L L^T, E v = (B B^T + 1)^-1 B L^-1 r with B = prior J L^-T */
 static int least_squares(const situation *s, const double *qd, const double *qdd, const double *qdd_std,
-                         const double *restrict force, const double *restrict S, int n, const double (*restrict J)[NQ],
+                         const double *restrict force, const double *restrict S, int n, double (*restrict J)[NQ],
                          const double *restrict prior, double *restrict m, double *restrict V) {
   enum { MOST = NQ + UNKNOWNS + 1 };
   const int rows = n + 1, width = NQ + rows;
