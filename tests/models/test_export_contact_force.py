@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import re
 from pathlib import Path
 
 import pytest
@@ -20,8 +21,6 @@ from slow import slow_except
 
 LEAST = 1e-9
 """Below the standard deviation of any force of a closed contact [N]."""
-LEGS = 1e-8
-"""Of a robot with a free base, whose mass matrix has a condition number of 1e5."""
 
 
 def apart(ours: Prediction, theirs: Prediction) -> float:
@@ -53,15 +52,11 @@ CASES = ["one_contact", "sparse", "exact", "every_friction", "rounded_tip"]
 def test_the_forces_of_the_fit(name: str) -> None:
     fit, fast = fitted(name), compiled(name)
     data, active = log_of(fit)
-    bits = {
-        x: torch.nextafter(getattr(data, x), torch.full_like(data.q, 9e9)) for x in ("q", "qd", "tau", "qdd")
-    }
-    moved = apart(fit.contact_force(data.replace(**bits)), fit.contact_force(data))
-    assert compare(fit, data, fast) < max(SAME, 4.0 * moved) < 1e-8
+    assert compare(fit, data, fast) < SAME
     stated = data.replace(extras={"qdd_std": torch.full_like(data.q, 0.7)})
     std = torch.full((7,), 0.7, dtype=torch.float64)
     noisy = fast.contact_force(data.q, data.qd, data.tau, data.qdd, active=active, qdd_std=std)
-    assert apart(noisy, fit.contact_force(stated)) < 1e-8
+    assert apart(noisy, fit.contact_force(stated)) < SAME
     assert apart(noisy, fit.contact_force(data)) > 1e3 * SAME
 
 
@@ -101,17 +96,11 @@ def test_its_code_compiles_without_warnings_and_sanitizers_find_nothing(
     flags = ["-O0", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
     ran = built(folder, *flags)
     assert ran.returncode == 0, ran.stdout + ran.stderr
-    text = (folder / "test_controller.c").read_text()
-    line = next(x for x in text.splitlines() if x.startswith("static const double contact_force["))
-    row = next(
-        x for x in text[text.index(line) :].partition("};")[0].split("{")[2:] if not x.startswith("0.0")
-    )
-    first = row.partition(",")[0]
-    (folder / "test_controller.c").write_text(
-        text.replace(line, line.replace(first, repr(float(first) * 1.001)))
-    )
-    if line.count(first):
-        assert built(folder, "-O0").returncode == 1, "a wrong force is not found"
+    test = folder / "test_controller.c"
+    before, name, table = test.read_text().partition("double contact_force[")
+    force = next(x for x in re.findall(r"-?\d+\.[-\de.]+", table) if float(x) != 0.0)
+    test.write_text(before + name + table.replace(force, repr(float(force) * 1.001), 1))
+    assert built(folder, "-O0").returncode == 1, "a wrong force is not found"
 
 
 @pytest.mark.slow
@@ -122,8 +111,8 @@ def test_four_feet_of_a_walking_robot() -> None:
     fit, (_, _, test, _) = test_legs.fitted(), test_legs.walking()
     fast, names = fit.compiled(jacobians=False), fit.system.contact_names
     data = test[::20].replace(header=DataHeader(ordered=False))
-    assert compare(fit, data, fast) < LEGS
+    assert compare(fit, data, fast) < SAME
     for feet in itertools.product((False, True), repeat=4):
         closed = {x: torch.full((len(data),), shut) for x, shut in zip(names, feet, strict=True)}
         if any(feet):
-            assert compare(fit, data.replace(contact=closed), fast) < LEGS, feet
+            assert compare(fit, data.replace(contact=closed), fast) < SAME, feet
