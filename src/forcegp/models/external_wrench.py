@@ -269,7 +269,7 @@ class ContactUnknown:
     def unknown(
         self, fit: LearnedForces, at: States, friction: Callable[[str, Tensor], tuple[Tensor, Tensor]]
     ) -> Unknown:
-        """Return the unknown forces `(n, 3 c)`, given the mean and covariance of B J_EᵀF_z of each contact."""
+        """Return the unknown forces `(n, 3 c)`, given the mean and covariance of B J_EᵀF_z as a function."""
         each = [self._at(name, fit, at, friction) for name in self.contacts]
         J, prior, offset, directions = zip(*each, strict=True)
         blocks = [torch.block_diag(*row) for row in zip(*(D.unbind() for D in directions), strict=True)]

@@ -47,7 +47,7 @@ typedef struct {
   touching contact[SOME(CONTACTS)];
   double x[SOME(INPUTS)], phi[SOME(FEATURES)]; /* standardized inputs and features of the priors */
   double expected[NQ];                         /* force that learned terms are expected to have */
-  double pressing[SOME(ROWS)];                 /* lambda of known and expected forces with friction of contacts */
+  double pressing[SOME(ROWS)];                 /* lambda that multiplies errors of friction coefficients */
 } equations;
 
 /* K = G^-1 `(n, n)` with the lower Cholesky factor G of M = G G^T, and V = K^T K = M^-1 unless it is NULL; returns 0 unless M
@@ -236,6 +236,7 @@ static int friction_gain(const equations *e, double *restrict gain) {
   return 1;
 }
 
+/* the multiplier under known and expected forces with friction of contacts */
 static void pressing_forces(const double *restrict tau, const double *restrict gain, equations *restrict e) {
   double Q[NQ], qdd[NQ], load[ROWS];
   for (int j = 0; j < NQ; ++j)
@@ -404,7 +405,7 @@ static int against(const equations *restrict e, const double *restrict qd, int c
   return !loaded || relief > 0.0;
 }
 
-/* E = d(mu u)/d(log mu, log eps) lambda */
+/* E = d(mu u)/d(log mu, log eps) lambda, with lambda under known and expected forces and friction of contacts */
 static void friction_error(const equations *restrict e, int c, double mu, double smoothing, double (*restrict E)[NQ]) {
   const touching *at = &e->contact[c];
   const double square = dot(at->sliding, at->sliding, 3), fading = smoothing * smoothing / (square + smoothing * smoothing);
@@ -538,13 +539,19 @@ static void operators(const affine *restrict z, const latent *restrict f, int si
     }
 }
 
-/* a column p = B_z J_E^T (1 - n n^T) sqrt(sigma^2 + s^2 k) for the tangential force of a contact along world axis x,
- * which is no function of the state, with k = exp(-(v/v_s)^2); zero while the contact is open */
+/* sigma^2 + s^2 exp(-(v/v_s)^2), the variance of the tangential force of a contact that is no function of the state */
+static double tip_variance(const equations *restrict e, int contact) {
+  const touching *at = &e->contact[contact];
+  const double *tip = TIP[contact];
+  return tip[0] + tip[1] * exp(-dot(at->sliding, at->sliding, 3) / (tip[2] * tip[2]));
+}
+
+/* a column p = B_z J_E^T (1 - n n^T) std for this force along world axis x; zero while the contact is open or if the size of
+ * the force is not learned */
 static void contact_unknown(const affine *restrict z, const equations *restrict e, int contact, int x, int size,
                             double *restrict p) {
   const touching *at = &e->contact[contact];
-  const double slow = dot(at->sliding, at->sliding, 3) / (TIP_SPEED[contact] * TIP_SPEED[contact]);
-  const double std = e->closed[contact] ? sqrt(SLIDE_VARIANCE[contact] + REST_VARIANCE[contact] * exp(-slow)) : 0.0;
+  const double std = TIP_LEARNED[contact] && e->closed[contact] ? sqrt(tip_variance(e, contact)) : 0.0;
   for (int a = 0; a < size; ++a) p[a] = std * dot(z->B_z[a], at->sliding_jacobian[x], NQ);
 }
 
@@ -576,9 +583,9 @@ static void add_rows(pending *restrict p, int size, int width, double (*restrict
   p->count = 0;
 }
 
-/* root = W T `(size, RANK)` for W^T `(COMPONENTS, size)`, with the row T_k = V^T C of each component. Rows of C are used directly
- * for a component with one function, or with one nonzero entry of W. Returns the number of columns,
- * and the number of nonzero entries of W for each component */
+/* root = W T `(size, RANK)` for W^T `(COMPONENTS, size)`, with the row T_k = V^T C of each component. Rows of C are used
+ * directly for a component with one function, or with one nonzero entry of W. Returns the number of columns, and the
+ * number of nonzero entries of W for each component */
 static int carry(const latent *restrict f, const double *restrict W, int size, double (*restrict root)[PADDED],
                  int *restrict uses) {
   pending rows;

@@ -80,7 +80,6 @@ def write_export(
     rounding = f"Single precision: at {where} states, the mean of q̈ and λ errs by at most {in_mean:.2g} "
     rounding += f"of max(|mean|, σ),\nand σ by at most a fraction of {in_std:.2g}."
     coarse = model.dtype == torch.float32
-    wanted = f"{name.upper()}_QDD | {name.upper()}_MULTIPLIER"
     fields = {
         "real": "float" if coarse else "double",
         "rounding": rounding if coarse else "",
@@ -90,9 +89,7 @@ def write_export(
         "functions": result.functions,
         "loss": loss,
         "tables": _reference(model, fit, name),
-        "jacobian": f"{name}_jacobian(q[i], qd[i], tau[i], closed[i], {wanted}, m, J)",
     }
-    fields |= {} if model.jacobians else {"jacobian": f"{name.upper()}_NO_JACOBIAN + 0 * (int)J[0]"}
     texts = {f"{name}.h": header, f"{name}.c": source, f"test_{name}.c": template("test.c", fields)}
     texts |= {file: template(f"{file}.in", fields) for file in ("CMakeLists.txt", "README.md")}
 
@@ -187,6 +184,7 @@ def _reference(model: ExportedModel, fit: Predictor, name: str) -> str:
         along = fit.linearize(q, qd, tau, active=active)
         both = [torch.stack(along[at : at + 3], dim=-2).flatten(1) for at in (1, 5)]
         tables["slopes"] = torch.cat(both, dim=1)
+        lines.append("#define JACOBIANS")
     lines.append(f"enum {{ SLOPES = {tables['slopes'].shape[1]} }};")
     if model.wrench is not None or model.reads_contacts:
         # The accelerations are within the model's errors, since rounding errors grow with the wrench.

@@ -260,7 +260,10 @@ class Mean:
                 return {name: list(column) for name, column in columns.items()}
             driven = self.robot.driven.tolist()
             zero = self.graph.constant(0.0)
-            return {name: [x if acts else zero for x, acts in zip(column, driven, strict=True)] for name, column in columns.items()}
+            return {
+                name: [x if acts else zero for x, acts in zip(column, driven, strict=True)]
+                for name, column in columns.items()
+            }
         if isinstance(prior, contact.SurfaceForcePrior):
             at = self.touching[self.names.index(prior.contact)]
             square = at.sliding @ at.sliding

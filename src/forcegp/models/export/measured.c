@@ -149,7 +149,7 @@ int forcegp_external_wrench(const forcegp_learned *learned, long count, const do
 /* ---- the forces F = lambda (n - mu s(v)) + F_z + u of closed contacts, with w = (lambda, y) and F_z + u = mean + t R y.
  * Learned friction F_z belongs to the unknown forces here, not to those in S. ---- */
 
-/* eigenvalues `d` and the first eigenvector (c, s) of a symmetric 2 x 2 matrix by a Jacobi rotation; the second one is (-s, c) */
+/* eigenvalues d and the first eigenvector (c, s) of a symmetric 2 x 2 matrix by a Jacobi rotation; the second is (-s, c) */
 static void axes_of(const double *restrict C, double *restrict d, double *restrict c, double *restrict s) {
   const double zeta = (C[0] - C[3]) / (2.0 * C[2]);
   const double t = C[2] == 0.0 ? 0.0 : (zeta < 0.0 ? -1.0 : 1.0) / (fabs(zeta) + sqrt(1.0 + zeta * zeta));
@@ -183,8 +183,7 @@ static void force_of_contact(const situation *s, int contact, const double *rest
                              double *restrict m, double (*restrict D)[3]) {
   enum { N = 2 * CONTACTS };
   const touching *at = &s->e.contact[contact];
-  const double slow = dot(at->sliding, at->sliding, 3) / (TIP[contact][2] * TIP[contact][2]);
-  const double variance = TIP[contact][0] + TIP[contact][1] * exp(-slow);
+  const double variance = tip_variance(&s->e, contact);
   double C[4] = {friction[0] + variance, 0.0, friction[N], friction[N + 1] + variance}, d[2], c, e;
   axes_of(C, d, &c, &e);
   for (int t = 0; t < 2; ++t) d[t] = sqrt(d[t] > LEAST_VARIANCE ? d[t] : LEAST_VARIANCE);

@@ -236,10 +236,10 @@ class ExportedModel:
         return self._of_rows(self.posterior.latent)
 
     def parts_of_motion(self) -> list[Functions]:
-        """Functions of each prior, with errors of inertia replaced by those of the parameters that affect the motion.
+        """Functions of each prior, with errors of base parameters instead of all inertial parameters.
 
-        The forces have the same posterior. If the sign of T Tᵀ is negative, D is diagonal only for errors of
-        all parameters, which are returned.
+        The posterior of the forces is the same. If the sign of T Tᵀ is negative, D is diagonal only for
+        errors of all parameters, and these are returned.
         """
         parts = self.parts()
         p = next((p for p, part in enumerate(parts) if isinstance(part.prior, InertialPrior)), None)
@@ -324,7 +324,7 @@ class ExportedModel:
 
 
 def _acting_errors(part: Functions, robot: RobotModel) -> tuple[Tensor, tuple[int, ...]]:
-    """Return the matrix that maps the weights of errors of inertia to errors of base parameters and of drives.
+    """Return B, which maps the weights of errors of inertia to errors of base parameters and drives.
 
     The second value contains the columns of these parameters in [Y, diag q̈].
     """
@@ -332,7 +332,9 @@ def _acting_errors(part: Functions, robot: RobotModel) -> tuple[Tensor, tuple[in
     assert part.finite is not None and isinstance(part.finite.kernel, Constant)
     links = base.combination.shape[1]
     drives = links + units[links:].nonzero()[:, 0]
-    B = torch.cat([pad(torch.from_numpy(base.combination), (0, len(units) - links)), torch.eye(len(units))[drives]])
+    B = torch.cat(
+        [pad(torch.from_numpy(base.combination), (0, len(units) - links)), torch.eye(len(units))[drives]]
+    )
     return B * units * part.finite.kernel.std(part.finite.params), (*base.columns, *drives.tolist())
 
 

@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from importlib.resources import files
@@ -314,11 +313,10 @@ class Writer:
         sticks = STICK_NOISE in values
         self.array((2.0 * values[STICK_NOISE]).exp() if sticks else zero, "STICK_VARIANCE")
         self.array(values[STICK_SPEED].exp() if sticks else zero + 1.0, "STICK_SPEED")
-        tips = [tip_keys(name) for name in self.model.system.contact_names]
-        for name, field in (("SLIDE", "slides"), ("REST", "rests")):
-            log = [float(values.get(getattr(tip, field), -math.inf)) for tip in tips]
-            self.array([math.exp(2.0 * x) for x in log] or [0.0], f"{name}_VARIANCE")
-        self.array([math.exp(float(values.get(tip.speed, 0.0))) for tip in tips] or [1.0], "TIP_SPEED")
+        names = self.model.system.contact_names
+        tips = [unknown_tip(values, name) for name in names] or [(0.0, 0.0, 1.0)]
+        self.array(torch.tensor(tips, dtype=torch.float64), "TIP")
+        self.array([tip_keys(name).rests in values for name in names], "TIP_LEARNED", "int")
         for name, std in (("TORQUE", self.model.torque_std), ("EXTERNAL", self.model.external_std)):
             variance = zero if std is None else std.expand(nq) ** 2
             if name == "EXTERNAL" and MEMORY in values:  # a program follows no bristles
@@ -364,8 +362,6 @@ class Writer:
             owners = [part.prior for part in self.parts for _ in range(part.components)]
             owners = [getattr(prior, "contact", None) for prior in owners]
             self.array([-1 if name is None else names.index(name) for name in owners], "OWNER", "int")
-            tips = [unknown_tip(self.model.tensors, name) for name in names]
-            self.array(torch.tensor(tips, dtype=torch.float64), "TIP")
             self.lines.append(f"static const double NORMAL_STD = {MULTIPLIER_STD!r};")
             self.lines.append(f"static const double LEAST_VARIANCE = {LEAST_VARIANCE!r};")
 

@@ -33,11 +33,16 @@ static void compare(int n, const @real@ *m, const @real@ *C, const double *mean,
 
 int main(void) {
   double in_slopes = 0.0;
-  @real@ m[D], C[D * D], beyond[@NAME@_JOINTS], J[SLOPES];
+  static @real@ J[SLOPES];
+  @real@ m[D], C[D * D], beyond[@NAME@_JOINTS];
   if (@name@_size(WANTED) != D) return 2;
   for (int i = 0; i < STATES; ++i) {
     double most = 0.0;
-    const int second = @jacobian@;
+#ifdef JACOBIANS
+    const int second = @name@_jacobian(q[i], qd[i], tau[i], closed[i], @NAME@_QDD | @NAME@_MULTIPLIER, m, J);
+#else
+    const int second = @NAME@_NO_JACOBIAN;
+#endif
     int status = @name@_predict(q[i], qd[i], tau[i], closed[i], WANTED, 0, m, C, beyond);
     if (status == @NAME@_UNDETERMINED) status = 0;
     if (status == 0) compare(D, m, C, mean[i], covariance[i]);
