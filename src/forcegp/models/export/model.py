@@ -245,27 +245,24 @@ class ExportedModel:
         p = next((p for p, part in enumerate(parts) if isinstance(part.prior, InertialPrior)), None)
         if p is None or self.sign < 0:
             return parts
-        B, parameters = _acting_errors(parts[p], self.system.robot)
-        C = torch.cat([pad(C, (x, 0)) for part in parts for C, x in zip(part.roots, part.first, strict=True)])
-        at = sum(len(C) for part in parts[:p] for C in part.roots)
-        C = torch.cat([C[:at], B @ C[at : at + B.shape[1]], C[at + B.shape[1] :]])
-        # C Cᵀ = R Rᵀ with an upper triangular R, whose rows keep their columns.
-        surplus = [at + k for k in range(B.shape[1]) if k not in parameters]
-        order = surplus + [i for i in range(C.shape[1]) if i not in surplus]
-        R = torch.linalg.qr(C[:, order].flip(0, 1).mT, mode="r").R.mT.flip(0, 1)
+        part, (B, parameters) = parts[p], _acting_errors(parts[p], self.system.robot)
+        C = [pad(C, (x, 0)) for part in parts for C, x in zip(part.roots, part.first, strict=True)]
+        at = sum(len(part.roots) for part in parts[:p])
+        C[at : at + B.shape[1]] = errors = (B @ torch.cat(C[at : at + B.shape[1]])).split(1)
         one = KernelPart(Constant(), {"log_scale": B.new_zeros(len(B))})
-        first, result = 0, []
-        for part in parts:
-            acts = part is parts[p]
-            sizes = len(B) * [1] if acts else [len(C) for C in part.roots]
-            starts = list(accumulate(sizes, initial=first))
-            roots = tuple(R[i:j, i:] for i, j in pairwise(starts))
-            part = dataclasses.replace(part, roots=roots, first=tuple(starts[:-1]))
-            if acts:
-                weights = B @ part.weights
-                part = dataclasses.replace(part, weights=weights, finite=one, parameters=parameters)
-            first, result = starts[-1], [*result, part]
-        return result
+        changes = {"weights": B @ part.weights, "finite": one, "roots": errors, "parameters": parameters}
+        parts[p] = dataclasses.replace(part, **changes)
+        # C Cᵀ = R Rᵀ with an upper triangular R, whose rows keep their columns.
+        surplus = [part.first[0] + k for k in range(B.shape[1]) if k not in parameters]
+        order = surplus + [i for i in range(part.rank) if i not in surplus]
+        R = torch.linalg.qr(torch.cat(C)[:, order].flip(0, 1).mT, mode="r").R.mT.flip(0, 1)
+        first = 0
+        for i, part in enumerate(parts):
+            starts = list(accumulate(map(len, part.roots), initial=first))
+            roots = tuple(R[a:b, a:] for a, b in pairwise(starts))
+            parts[i] = dataclasses.replace(part, roots=roots, first=tuple(starts[:-1]))
+            first = starts[-1]
+        return parts
 
     def _of_basis(self, latent: SparsePosterior) -> list[Functions]:
         basis, parts = latent.basis, []
@@ -332,9 +329,8 @@ def _acting_errors(part: Functions, robot: RobotModel) -> tuple[Tensor, tuple[in
     assert part.finite is not None and isinstance(part.finite.kernel, Constant)
     links = base.combination.shape[1]
     drives = links + units[links:].nonzero()[:, 0]
-    B = torch.cat(
-        [pad(torch.from_numpy(base.combination), (0, len(units) - links)), torch.eye(len(units))[drives]]
-    )
+    of_links = pad(torch.from_numpy(base.combination), (0, len(units) - links))
+    B = torch.cat([of_links, torch.eye(len(units), dtype=of_links.dtype)[drives]])
     return B * units * part.finite.kernel.std(part.finite.params), (*base.columns, *drives.tolist())
 
 
