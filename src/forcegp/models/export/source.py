@@ -316,7 +316,7 @@ class Writer:
         names = self.model.system.contact_names
         tips = [unknown_tip(values, name) for name in names] or [(0.0, 0.0, 1.0)]
         self.array(torch.tensor(tips, dtype=torch.float64), "TIP")
-        self.array([tip_keys(name).rests in values for name in names], "TIP_LEARNED", "int")
+        self.array([tip_keys(name).rests in values for name in names] or [0], "TIP_LEARNED", "int")
         for name, std in (("TORQUE", self.model.torque_std), ("EXTERNAL", self.model.external_std)):
             variance = zero if std is None else std.expand(nq) ** 2
             if name == "EXTERNAL" and MEMORY in values:  # a program follows no bristles
