@@ -256,12 +256,10 @@ class Mean:
                 text = f"the columns of {prior.name!r} have no form in C and CasADi: {cause}"
                 expected = "arithmetic, abs, integer powers and the functions of forcegp.forces.term"
                 raise ModelError(text, expected=expected) from cause
-            if not prior.needs_drive:
-                return {name: list(column) for name, column in columns.items()}
-            driven = self.robot.driven.tolist()
             zero = self.graph.constant(0.0)
+            acts = [driven or not prior.needs_drive for driven in self.robot.driven.tolist()]
             return {
-                name: [x if acts else zero for x, acts in zip(column, driven, strict=True)]
+                name: [x if y else zero for x, y in zip(column, acts, strict=True)]
                 for name, column in columns.items()
             }
         if isinstance(prior, contact.SurfaceForcePrior):

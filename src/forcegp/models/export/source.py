@@ -290,7 +290,8 @@ class Writer:
                 self.lines.append(f"#define INERTIAL {start}")
                 self.lines.append(f"#define INERTIAL_COUNT {part.components}")
                 columns, units = part.inertial(robot)
-                self.array(columns, "INERTIAL_COLUMN", "int"), self.array(units, "INERTIAL_UNITS")
+                self.array(columns, "INERTIAL_COLUMN", "int")
+                self.array(units, "INERTIAL_UNITS")
             if isinstance(part.prior, PayloadPrior):
                 self.lines.append(f"#define PAYLOAD {start}")
                 first = PER_PAYLOAD * part.prior.link(robot)
