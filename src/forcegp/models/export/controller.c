@@ -50,22 +50,34 @@ typedef struct {
   double pressing[SOME(ROWS)];                 /* lambda that multiplies errors of friction coefficients */
 } equations;
 
+/* [M, R] becomes [G^T, G^-1 R], with the lower Cholesky factor G of M = G G^T `(n, n)`, in rows of `width` numbers; returns 0
+ * unless M is positive definite. Only the upper triangle of M is read. Loops run along rows, so that compilers use vector
+ * registers */
+static int eliminate(double *U, int n, int width) {
+  for (int k = 0; k < n; ++k) {
+    double *restrict pivot = U + k * width;
+    const double inverse_size = 1.0 / sqrt(pivot[k]);
+    if (!(pivot[k] > 0.0)) return 0;
+    for (int j = k; j < width; ++j) pivot[j] *= inverse_size;
+    for (int i = k + 1; i < n; ++i) {
+      double *restrict below = U + i * width;
+      const double share = pivot[i];
+      for (int j = i; j < width; ++j) below[j] -= share * pivot[j];
+    }
+  }
+  return 1;
+}
+
 /* K = G^-1 `(n, n)` with the lower Cholesky factor G of M = G G^T, and V = K^T K = M^-1 unless it is NULL; returns 0 unless M
- * is positive definite. Loops run along rows, so that compilers use vector registers */
+ * is positive definite */
 static int inverse(const double *restrict M, int n, double *restrict K, double *restrict V) {
   double U[MOST_UNKNOWNS * MOST_UNKNOWNS]; /* G^T */
   memcpy(U, M, sizeof(double) * n * n);
+  if (!eliminate(U, n, n)) return 0;
+  /* row k of K = (1 - sum of G_ki K_i) / G_kk */
   for (int k = 0; k < n; ++k) {
-    double *restrict pivot = U + k * n, *restrict row = K + k * n;
-    const double inverse_size = 1.0 / sqrt(pivot[k]);
-    if (!(pivot[k] > 0.0)) return 0;
-    for (int j = k; j < n; ++j) pivot[j] *= inverse_size;
-    for (int i = k + 1; i < n; ++i) {
-      double *restrict below = U + i * n;
-      const double share = pivot[i];
-      for (int j = i; j < n; ++j) below[j] -= share * pivot[j];
-    }
-    /* row k of K = (1 - sum of G_ki K_i) / G_kk */
+    double *restrict row = K + k * n;
+    const double inverse_size = 1.0 / U[k * n + k];
     for (int j = 0; j < n; ++j) row[j] = j == k ? 1.0 : 0.0;
     for (int i = 0; i < k; ++i) {
       const double *restrict above = K + i * n, share = U[i * n + k];

@@ -19,35 +19,28 @@ static int measured(const forcegp_learned *learned, const double *q, const doubl
 static int least_squares(const situation *s, const double *qd, const double *qdd, const double *qdd_std,
                          const double *restrict force, const double *restrict S, int n, double (*restrict J)[NQ],
                          const double *restrict prior, double *restrict m, double *restrict V) {
-  enum { MOST = NQ + UNKNOWNS + 1 };
-  const int rows = n + 1, width = NQ + rows;
-  double unknown[NQ], U[NQ][MOST], precision[UNKNOWNS * UNKNOWNS], pull[UNKNOWNS], V_root[UNKNOWNS * UNKNOWNS];
+  const int width = NQ + n + 1;
+  double unknown[NQ], U[NQ * (NQ + UNKNOWNS + 1)], precision[UNKNOWNS * UNKNOWNS], pull[UNKNOWNS], V_root[UNKNOWNS * UNKNOWNS];
   unknown_forces(qd, s->far, 1, unknown);
-  /* U = [S, J^T prior, r] */
-  for (int i = 0; i < NQ; ++i) {
-    double by_noise[NQ], noise[NQ];
+  for (int i = 0; i < NQ; ++i) { /* [S, J^T prior, r] */
+    double *row = U + i * width, by_noise[NQ];
     for (int k = 0; k < NQ; ++k) {
       const double variance = qdd_std ? qdd_std[k] * qdd_std[k] : SENSOR_VARIANCE[0] ? SENSOR_VARIANCE[0][k] : 0.0;
       by_noise[k] = s->e.M[i][k] * variance;
     }
-    combine(&s->e.M[0][0], by_noise, NQ, NQ, noise);
-    for (int j = 0; j < NQ; ++j) U[i][j] = S[i * NQ + j] + noise[j];
-    U[i][i] += unknown[i];
-    for (int a = 0; a < n; ++a) U[i][NQ + a] = prior[a] * J[a][i];
-    U[i][NQ + n] = dot(s->e.M[i], qdd, NQ) - force[i];
+    combine(&s->e.M[0][0], by_noise, NQ, NQ, row);
+    for (int j = 0; j < NQ; ++j) row[j] += S[i * NQ + j];
+    row[i] += unknown[i];
+    for (int a = 0; a < n; ++a) row[NQ + a] = prior[a] * J[a][i];
+    row[NQ + n] = dot(s->e.M[i], qdd, NQ) - force[i];
   }
-  /* [L^T, B^T, L^-1 r] by elimination along rows */
-  for (int k = 0; k < NQ; ++k) {
-    const double inverse_size = 1.0 / sqrt(U[k][k]);
-    if (!(U[k][k] > 0.0)) return 0;
-    for (int j = k; j < width; ++j) U[k][j] *= inverse_size;
-    for (int i = k + 1; i < NQ; ++i)
-      for (int j = i; j < width; ++j) U[i][j] -= U[k][i] * U[k][j];
-  }
-  for (int a = 0; a < n; ++a) {
+  if (!eliminate(U, NQ, width)) return 0;
+  for (int a = 0; a < n; ++a) { /* rows of [B B^T, B L^-1 r] from the diagonal on */
     double sums[UNKNOWNS + 1] = {0.0};
-    for (int k = 0; k < NQ; ++k)
-      for (int b = a; b < rows; ++b) sums[b] += U[k][NQ + a] * U[k][NQ + b];
+    for (int k = 0; k < NQ; ++k) {
+      const double *B = U + k * width + NQ, share = B[a];
+      for (int b = a; b <= n; ++b) sums[b] += share * B[b];
+    }
     for (int b = a; b < n; ++b) precision[a * n + b] = sums[b] + (a == b ? 1.0 : 0.0);
     pull[a] = sums[n];
   }
