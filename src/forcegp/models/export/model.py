@@ -239,11 +239,12 @@ class ExportedModel:
         """Functions of each prior, with errors of base parameters instead of all inertial parameters.
 
         The posterior of the forces is the same. If the sign of T Tᵀ is negative, D is diagonal only for
-        errors of all parameters, and these are returned.
+        errors of all parameters, and these are returned, as for a model that learns online, with priors on
+        independent errors.
         """
         parts = self.parts()
         p = next((p for p, part in enumerate(parts) if isinstance(part.prior, InertialPrior)), None)
-        if p is None or self.sign < 0:
+        if p is None or self.sign < 0 or self.online:
             return parts
         part, (B, parameters) = parts[p], _acting_errors(parts[p], self.system.robot)
         C = [pad(C, (x, 0)) for part in parts for C, x in zip(part.roots, part.first, strict=True)]
