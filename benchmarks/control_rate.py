@@ -15,7 +15,7 @@ timed four at a time, to be short beside the time slices of a shared core.
 
 Then 100 function samples are rolled out for 10 s, and the examples of the force observer (60 s) and of
 predictive control run. `quadruped` times `contact_force` of all four feet of a Solo12 (`legs.py`, friction
-`coulomb`) with its covariance, and predictions without Jacobians.
+`coulomb`) with its covariance, and predictions, both without learning online and without Jacobians.
 
 Times of calls are least ones, those of rollouts and control steps processor time.
 `--only` measures a part. It takes some eight minutes, two of them for Pinocchio in C++.
@@ -423,7 +423,7 @@ def quadruped() -> dict[str, float]:
     for jacobians in (False, True):
         begin = time.perf_counter()
         with tempfile.TemporaryDirectory() as place:
-            folder = fit.export(Path(place) / "c", jacobians=jacobians).folder
+            folder = fit.export(Path(place) / "c", jacobians=jacobians, online=False).folder
             (folder / "states.h").write_text(states_in_c((walk.q, walk.qd, walk.tau, walk.qdd)))
             (folder / "time.c").write_text(QUADRUPED)
             command = ["gcc", "-std=c99", *LEVELS["-O3"], "time.c", "controller.c", "-o", "run", "-lm"]

@@ -78,11 +78,30 @@ def test_what_is_refused() -> None:
         free.contact_force(x, x, x, x)
     with pytest.raises(ShapeError, match="qdd contains values that are not finite"):
         compiled("one_contact").contact_force(x, x, x, x * float("nan"))
-    plain = fitted("free_friction").compiled(jacobians=False)
+    plain = fitted("free_friction").compiled(jacobians=False, online=False)
+    with pytest.raises(ModelError, match="cannot learn online"):
+        plain.update(x, x, x, x)
     with pytest.raises(ModelError, match="without Jacobians"):
         plain.linearize(x, x, x)
     ours, theirs = plain.predict(x, x, x), free.predict(x, x, x)
     torch.testing.assert_close(ours.mean, theirs.mean)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["free_inertial", "uncertain_inertia"])
+def test_errors_of_base_parameters_are_fewer_and_have_the_same_effect(name: str) -> None:
+    fit = fitted(name)
+    fast, (data, active) = fit.compiled(online=False), log_of(fit)
+    functions = [
+        sum(part.components for part in parts) for parts in (fast.model.parts(), fast.model.parts_of_motion())
+    ]
+    assert functions[0] - functions[1] >= 20  # of 70 parameters of links, at most 48 affect the motion
+    state = data.q, data.qd, data.tau
+    assert apart(fast.predict(*state, active=active), fit.predict(*state, active=active)) < SAME
+    for ours, theirs in zip(
+        fast.linearize(*state, active=active), fit.linearize(*state, active=active), strict=True
+    ):
+        torch.testing.assert_close(ours, theirs, rtol=1e-8, atol=1e-8)
 
 
 @needs_gcc
@@ -109,7 +128,7 @@ def test_four_feet_of_a_walking_robot() -> None:
 
     pytest.importorskip("mujoco")
     fit, (_, _, test, _) = test_legs.fitted(), test_legs.walking()
-    fast, names = fit.compiled(jacobians=False), fit.system.contact_names
+    fast, names = fit.compiled(jacobians=False, online=False), fit.system.contact_names
     data = test[::20].replace(header=DataHeader(ordered=False))
     assert compare(fit, data, fast) < SAME
     for feet in itertools.product((False, True), repeat=4):

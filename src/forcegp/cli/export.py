@@ -46,6 +46,10 @@ def export(
     no_jacobians: Annotated[
         bool, Option("--no-jacobians", help="For C: leave out Jacobians, most of the code of a legged robot.")
     ] = False,
+    no_online: Annotated[
+        bool,
+        Option("--no-online", help="For C: leave out learning online, which speeds up uncertain inertia."),
+    ] = False,
     robot: Annotated[
         str | None, Option(help="URDF or MJCF file of the robot, or name of a bundled robot.")
     ] = None,
@@ -103,7 +107,8 @@ def export(
     x, y, z = numbers("point", point, 3)
     wrench = None if frame is None else WrenchFrame(frame, reference, words(axes), (x, y, z))
     dtype = torch.float32 if float32 else torch.float64
-    settings = {"functions": functions, "wrench": wrench, "dtype": dtype, "jacobians": not no_jacobians}
+    settings = {"functions": functions, "wrench": wrench, "dtype": dtype}
+    settings |= {"jacobians": not no_jacobians, "online": not no_online}
     written = fit.export(out, language=to, name=name, **settings)
     lost: dict[str, object] = {}
     if written.loss:

@@ -175,7 +175,7 @@ class CompiledFit(Predictor):
         if not self.model.online:
             raise ModelError(
                 "this fit cannot learn online in C",
-                expected="sparse inference with all functions, without state noise, learned inertia or delay",
+                expected="sparse inference with all functions, without state noise or delay, and online=True",
                 hint="call the `update` method of the fit",
             )
         parts = self.model.parts()

@@ -137,7 +137,7 @@ class ExportedModel:
         functions: number r of functions in a reduced-rank covariance. `None` means all functions, and 0 means
             that only the mean is exported.
         sampling: for samples learned online, the variance of the torque noise `(nq,)`, the exponent κ of the
-            likelihood, and whether samples must be in motion. It is `None` if the model cannot learn online.
+            likelihood, and whether samples must be in motion. `None` if it does not learn online.
         wrench: the frame and components of an external wrench to estimate, or `None`.
         dtype: precision of the C code.
         never_closed: contacts that are never closed in the training data.
