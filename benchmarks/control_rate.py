@@ -14,7 +14,10 @@ install --target peers --no-deps gpytorch linear_operator mpmath cmeel-eigen`, o
 timed four at a time, to be short beside the time slices of a shared core.
 
 Then 100 function samples are rolled out for 10 s, and the examples of the force observer (60 s) and of
-predictive control run. Times of calls are least ones, those of rollouts and control steps processor time.
+predictive control run. `quadruped` times `contact_force` of all four feet of a Solo12 (`legs.py`, friction
+`coulomb`) with its covariance, and predictions, both without learning online and without Jacobians.
+
+Times of calls are least ones, those of rollouts and control steps processor time.
 `--only` measures a part. It takes some eight minutes, two of them for Pinocchio in C++.
 """
 
@@ -54,7 +57,7 @@ from forcegp.simulate import SimulationConfig, simulate
 
 POINTS, STATES, ROUNDS, SAMPLES = 71, 256, 60, 100
 EXAMPLES = Path(__file__).parents[1] / "examples"
-PARTS = ("calls", "rollouts", "observer", "tracking", "force")
+PARTS = ("calls", "rollouts", "observer", "tracking", "force", "quadruped")
 LEVELS = {"-O3": ["-O3", "-march=native", "-ffp-contract=fast"], "-O2": ["-O2"]}
 BOUNDS = {  # µs, at -O3
     "friction mean": 8.0,
@@ -85,6 +88,8 @@ BOUNDS = {  # µs, at -O3
     "tracking solve": 20.0,
     "force outside": 0.05,
     "force solve": 20.0,
+    # µs
+    "quadruped feet": 40.0,
 }
 KINDS = ("mean", "covariance", "forward dynamics", "update", "covariance after updates", "jacobian")
 PROGRAM = """\
@@ -137,6 +142,43 @@ int main(void) {
 """
 
 
+QUADRUPED = """\
+#define _POSIX_C_SOURCE 199309L
+#include <stdio.h>
+#include <time.h>
+#include "controller.h"
+#include "states.h"
+
+static double now(void) {
+  struct timespec t;
+  clock_gettime(CLOCK_MONOTONIC, &t);
+  return 1e6 * (double)t.tv_sec + 1e-3 * (double)t.tv_nsec;
+}
+
+int main(void) {
+  static double mean[64], covariance[64 * 64];
+  double best[3] = {1e30, 1e30, 1e30}, sink = 0.0;
+  for (int round = 0; round < ROUNDS; ++round)
+    for (int kind = 0; kind < 3; ++kind) {
+      const double start = now();
+      for (int i = 0; i < STATES; ++i) {
+        const int status =
+            kind == 0 ? controller_contact_force(NULL, 1, q[i], qd[i], tau[i], qdd[i], NULL, NULL, mean,
+                                                 covariance, NULL)
+                      : controller_predict(q[i], qd[i], tau[i], NULL, CONTROLLER_QDD | CONTROLLER_MULTIPLIER,
+                                           0, mean, kind == 1 ? NULL : covariance, NULL);
+        if (status != 0 && status != CONTROLLER_UNDETERMINED) return 1;
+        sink += mean[0];
+      }
+      const double each = (now() - start) / STATES;
+      best[kind] = each < best[kind] ? each : best[kind];
+    }
+  printf("%g %g %g %g\\n", best[0], best[1], best[2], sink);
+  return 0;
+}
+"""
+
+
 def models() -> dict[str, StructuredFit]:
     """The fits, conditioned at the hyperparameters where learning begins."""
     system = forcegp.load_scene("kuka_plane").system()
@@ -165,12 +207,12 @@ def logged(fit: StructuredFit) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     return m.q[:STATES], m.qd[:STATES], m.tau[:STATES], m.values[:STATES]
 
 
-def states_in_c(fit: StructuredFit) -> str:
+def states_in_c(states: Sequence[Tensor]) -> str:
     """Logged states as C tables."""
-    lines = [f"enum {{ STATES = {STATES}, ROUNDS = {ROUNDS} }};"]
-    for name, x in zip(("q", "qd", "tau", "qdd"), logged(fit), strict=True):
+    lines = [f"enum {{ STATES = {len(states[0])}, ROUNDS = {ROUNDS} }};"]
+    for name, x in zip(("q", "qd", "tau", "qdd"), states, strict=True):
         rows = ", ".join("{" + ", ".join(map(repr, row)) + "}" for row in x.tolist())
-        lines.append(f"static const double {name}[STATES][7] = {{{rows}}};")
+        lines.append(f"static const double {name}[STATES][{x.shape[1]}] = {{{rows}}};")
     return "\n".join(lines)
 
 
@@ -178,7 +220,7 @@ def in_c(fit: StructuredFit, flags: list[str]) -> dict[str, float]:
     """µs of each of `KINDS`."""
     with tempfile.TemporaryDirectory() as place:
         folder = fit.export(Path(place) / "c").folder
-        (folder / "states.h").write_text(states_in_c(fit))
+        (folder / "states.h").write_text(states_in_c(logged(fit)))
         (folder / "time.c").write_text(PROGRAM)
         command = ["gcc", "-std=c99", *flags, "time.c", "controller.c", "-o", "run", "-lm"]
         subprocess.run(command, cwd=folder, check=True)
@@ -288,7 +330,7 @@ def pinocchio_in_cpp(fit: StructuredFit) -> float | None:
     with tempfile.TemporaryDirectory() as place:
         robot = Path(forcegp.__file__).parent / "robot/bundled/kuka_iiwa.urdf"
         pin.buildModelFromUrdf(str(robot)).saveToText(str(Path(place) / "model.txt"))
-        (Path(place) / "states.h").write_text(states_in_c(fit))
+        (Path(place) / "states.h").write_text(states_in_c(logged(fit)))
         (Path(place) / "aba.cpp").write_text(PINOCCHIO)
         flags = ["-std=c++17", "-O2", "-DNDEBUG", "-w", "-DPINOCCHIO_ENABLE_TEMPLATE_INSTANTIATION"]
         flags += ["-DBOOST_MPL_LIMIT_LIST_SIZE=30", "-DBOOST_MPL_CFG_NO_PREPROCESSED_HEADERS"]
@@ -365,6 +407,38 @@ def calls(name: str, fit: StructuredFit) -> dict[str, float]:
     return result
 
 
+def quadruped() -> dict[str, float]:
+    """µs of the forces of four closed feet and of predictions; s of the export and of the compiler."""
+    import legs
+
+    legged = legs.Legged("solo12", "coulomb", 3)
+    gaits = legs.gaits(legged)
+    parts = ((legged.sway(), 4.0), (gaits["trot"], 6.0))
+    train = forcegp.Dataset.concatenate([legs.dataset(legged, legged.record(*part)) for part in parts])
+    walk = legs.dataset(legged, legged.record(gaits["walk"], 4.0))[::10]
+    fit = forcegp.StructuredGP(legs.system_of(legged)).fit(train[::5])
+    latent, result = fit.posterior.latent, dict[str, float]()
+    assert isinstance(latent, SparsePosterior)
+    result["quadruped functions"] = latent.basis.size
+    for jacobians in (False, True):
+        begin = time.perf_counter()
+        with tempfile.TemporaryDirectory() as place:
+            folder = fit.export(Path(place) / "c", jacobians=jacobians, online=False).folder
+            (folder / "states.h").write_text(states_in_c((walk.q, walk.qd, walk.tau, walk.qdd)))
+            (folder / "time.c").write_text(QUADRUPED)
+            command = ["gcc", "-std=c99", *LEVELS["-O3"], "time.c", "controller.c", "-o", "run", "-lm"]
+            subprocess.run(command, cwd=folder, check=True)
+            seconds = time.perf_counter() - begin
+            done = subprocess.run([str(folder / "run")], capture_output=True, text=True, check=True)
+        result[f"quadruped export and gcc [s]{', jacobians' if jacobians else ''}"] = seconds
+        if not jacobians:
+            names = ("feet", "mean", "covariance")
+            result |= {
+                f"quadruped {x} -O3": float(y) for x, y in zip(names, done.stdout.split(), strict=False)
+            }
+    return result
+
+
 def rolled_out(name: str, fit: StructuredFit) -> dict[str, float]:
     """Seconds of processor time of function samples that follow another run for 10 s at 240 Hz, and of making
     the C code before."""
@@ -438,6 +512,7 @@ def measure(parts: Sequence[str], seconds: float) -> dict[str, float]:
     if "force" in parts:
         found = controlled("mpc_holds_a_force.py", "force outside [%]", r"in ([\d.]+)%")
         result |= found | {"force outside": found["force outside [%], learned"] / 100.0}
+    result |= quadruped() if "quadruped" in parts else {}
     return result
 
 

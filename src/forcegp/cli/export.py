@@ -43,6 +43,13 @@ def export(
     float32: Annotated[
         bool, Option("--float32", help="For C: use single precision and report its rounding error.")
     ] = False,
+    no_jacobians: Annotated[
+        bool, Option("--no-jacobians", help="For C: leave out Jacobians, most of the code of a legged robot.")
+    ] = False,
+    no_online: Annotated[
+        bool,
+        Option("--no-online", help="For C: leave out learning online, which speeds up uncertain inertia."),
+    ] = False,
     robot: Annotated[
         str | None, Option(help="URDF or MJCF file of the robot, or name of a bundled robot.")
     ] = None,
@@ -100,7 +107,9 @@ def export(
     x, y, z = numbers("point", point, 3)
     wrench = None if frame is None else WrenchFrame(frame, reference, words(axes), (x, y, z))
     dtype = torch.float32 if float32 else torch.float64
-    written = fit.export(out, language=to, name=name, functions=functions, wrench=wrench, dtype=dtype)
+    settings = {"functions": functions, "wrench": wrench, "dtype": dtype}
+    settings |= {"jacobians": not no_jacobians, "online": not no_online}
+    written = fit.export(out, language=to, name=name, **settings)
     lost: dict[str, object] = {}
     if written.loss:
         lost = {"widest": written.widest, "wider": written.wider, "loss": written.loss.replace("\n", " ")}

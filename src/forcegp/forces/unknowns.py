@@ -21,6 +21,7 @@ import torch
 from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem, SurfaceContact
+from forcegp.forces.external_wrench import FORCE_STD
 from forcegp.forces.posterior import RELATIVE, STICKING
 from forcegp.forces.priors.base import NOISE
 from forcegp.forces.quantities import States
@@ -76,6 +77,19 @@ def tip_variance(tensors: Mapping[str, Tensor], at: States, contact: str) -> Ten
     keys = tip_keys(contact)
     slides, rests = ((2.0 * tensors[key]).exp() for key in (keys.slides, keys.rests))
     return slides + rests * share_at_rest(tensors, at, contact)
+
+
+def unknown_tip(tensors: Mapping[str, Tensor], contact: str) -> tuple[float, float, float]:
+    """Return σ², s² [N²] and v_s [m/s] of a contact with an unknown force.
+
+    Unless the size is learned, σ = 0 and s is `FORCE_STD`.
+    """
+    keys = tip_keys(contact)
+    speed = float(tensors[keys.speed].exp()) if keys.speed in tensors else STICKING
+    if keys.rests not in tensors:
+        return 0.0, FORCE_STD**2, speed
+    slides, rests = (float((2.0 * tensors[key]).exp()) for key in (keys.slides, keys.rests))
+    return slides, rests, speed
 
 
 def tip_operator(system: ConstrainedSystem, at: States, contact: str) -> Tensor:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol, runtime_checkable
 
@@ -196,9 +196,15 @@ def contact_force(
     closed = data.active(read).repeat_interleave(AXES, dim=-1)
     mean, covariance = mean[:, : closed.shape[-1]], covariance[:, : closed.shape[-1], : closed.shape[-1]]
     mean, covariance = mean * closed, covariance * closed[:, None] * closed[..., None]
-    parts = {name: slice(AXES * k, AXES * (k + 1)) for k, name in enumerate(read)}
-    parts = {"contact_force": slice(0, AXES)} if len(read) == 1 else parts
-    return Prediction(mean, covariance, parts, fit.beyond(data.qd, data.tau), fit.system.robot.joint_names)
+    far, joints = fit.beyond(data.qd, data.tau), fit.system.robot.joint_names
+    return Prediction(mean, covariance, parts_of_contacts(read), far, joints)
+
+
+def parts_of_contacts(names: Sequence[str]) -> dict[str, slice]:
+    """Return the slice of each contact in an array of their forces, or of the force of a single contact."""
+    if len(names) == 1:
+        return {"contact_force": slice(0, AXES)}
+    return {name: slice(AXES * k, AXES * (k + 1)) for k, name in enumerate(names)}
 
 
 def surface_contacts(system: ConstrainedSystem, first: str | None) -> tuple[str, ...]:
@@ -261,15 +267,21 @@ class ContactUnknown:
         return dataclasses.replace(posterior, process=dataclasses.replace(posterior.process, coulomb=coulomb))
 
     def unknown(
-        self, fit: LearnedForces, at: States, friction: Callable[[str], tuple[Tensor, Tensor]]
+        self, fit: LearnedForces, at: States, friction: Callable[[str, Tensor], tuple[Tensor, Tensor]]
     ) -> Unknown:
-        """Return the unknown forces `(n, 3 c)`, given the mean and covariance of J_EᵀF_z of each contact."""
-        each = [self._at(name, fit, at, friction(name)) for name in self.contacts]
+        """Return the unknown forces `(n, 3 c)`, given the mean and covariance of B J_EᵀF_z as a function."""
+        each = [self._at(name, fit, at, friction) for name in self.contacts]
         J, prior, offset, directions = zip(*each, strict=True)
         blocks = [torch.block_diag(*row) for row in zip(*(D.unbind() for D in directions), strict=True)]
         return Unknown(torch.cat(J, dim=-2), torch.cat(prior), torch.cat(offset, dim=-1), torch.stack(blocks))
 
-    def _at(self, name: str, fit: LearnedForces, at: States, friction: tuple[Tensor, Tensor]) -> Unknown:
+    def _at(
+        self,
+        name: str,
+        fit: LearnedForces,
+        at: States,
+        friction: Callable[[str, Tensor], tuple[Tensor, Tensor]],
+    ) -> Unknown:
         point, closed = at.eom.contact_points[name], at.active[:, fit.system.contact_names.index(name)]
         n, v, t = point.unit_normal, point.sliding[1], tangent_frame(point.unit_normal)
         normal, s = self.prior_std or (MULTIPLIER_STD, FORCE_STD)
@@ -279,8 +291,8 @@ class ContactUnknown:
             variance = s**2 * share_at_rest(fit.hyperparameters, at, name)
         # F_z + u in the tangent frame, with the covariance R Rᵀ
         to_tangent = torch.linalg.pinv((t.mT @ point.jacobian).mT)
-        mean, covariance = friction
-        C = to_tangent @ covariance @ to_tangent.mT + torch.diag_embed(variance[:, None].expand(-1, 2))
+        mean, C = friction(name, to_tangent)
+        C = C + torch.diag_embed(variance[:, None].expand(-1, 2))
         # The covariance of F_z is a difference, which rounding may make indefinite.
         sizes, axes = torch.linalg.eigh(0.5 * (C + C.mT))
         R = axes * sizes.clamp(min=LEAST_VARIANCE).sqrt()[..., None, :]
@@ -290,7 +302,7 @@ class ContactUnknown:
             if law.contact == name:
                 size = (v.square().sum(-1, keepdim=True) + law.smoothing**2).sqrt()
                 direction = direction - law.coefficient * v / size
-        offset = (t @ (to_tangent @ mean[..., None]))[..., 0]
+        offset = (t @ mean[..., None])[..., 0]
         directions = torch.cat([direction[..., None], t @ R], dim=-1)
         return Unknown(
             closed[:, None, None] * point.jacobian, n.new_tensor([normal, 1.0, 1.0]), offset, directions
@@ -374,14 +386,14 @@ class Reading:
         owners = [getattr(prior, "contact", None) for prior in posterior.priors]
         rows = posterior.rows(system, at, z)
 
-        def part(includes: Callable[[str | None], bool]) -> tuple[Tensor, Tensor]:
+        def part(includes: Callable[[str | None], bool], B: Tensor) -> tuple[Tensor, Tensor]:
             pairs = zip(owners, rows.operators, strict=True)
-            chosen = tuple(W if includes(owner) else torch.zeros_like(W) for owner, W in pairs)
-            block = dataclasses.replace(rows, operators=chosen)
+            chosen = tuple(B @ (W if includes(owner) else torch.zeros_like(W)) for owner, W in pairs)
+            block = dataclasses.replace(rows, operators=chosen, target=(B @ rows.target[..., None])[..., 0])
             return posterior.latent.mean(block), posterior.latent.covariance(block)
 
-        force = self.source.unknown(self.fit, at, lambda name: part(lambda owner: owner == name))
-        mean, S = part(lambda owner: owner not in names)
+        force = self.source.unknown(self.fit, at, lambda name, B: part(lambda owner: owner == name, B))
+        mean, S = part(lambda owner: owner not in names, torch.eye(at.q.shape[-1]).to(at.q))
         mean = mean + rows.target
         if force.offset is not None:
             mean = mean + (force.J.mT @ force.offset[..., None])[..., 0]

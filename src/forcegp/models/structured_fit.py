@@ -314,7 +314,12 @@ class StructuredFit(FittedModel):
         return contact_force(self, data, contact, prior_std)
 
     def _exported(
-        self, functions: int | None, wrench: WrenchFrame | None = None, dtype: torch.dtype = torch.float64
+        self,
+        functions: int | None,
+        wrench: WrenchFrame | None = None,
+        dtype: torch.dtype = torch.float64,
+        jacobians: bool = True,
+        online: bool = True,
     ) -> ExportedModel:
         if functions is not None and functions < 1:
             raise ModelError("at least one function must be drawn", expected="1 or more", got=functions)
@@ -325,9 +330,11 @@ class StructuredFit(FittedModel):
         variance = torch.zeros_like(self.system.robot.mass) + std**2
         moving = self.specification.noise.learns_torque
         # With state noise, the rows of a sample depend on the slopes of the learned forces.
-        sampling = None if self.problem.state_std is not None else (variance, self.problem.power, moving)
+        learns = online and self.problem.state_std is None
+        sampling = (variance, self.problem.power, moving) if learns else None
         never = self.result.never_closed
-        return ExportedModel(*parts, self.problem.external_std, functions, sampling, wrench, dtype, never)
+        parts = *parts, self.problem.external_std, functions, sampling, wrench, dtype, never, jacobians
+        return ExportedModel(*parts)
 
     def export(
         self,
@@ -338,12 +345,14 @@ class StructuredFit(FittedModel):
         functions: int | None = None,
         wrench: WrenchFrame | None = None,
         dtype: torch.dtype = torch.float64,
+        jacobians: bool = True,
+        online: bool = True,
     ) -> Export:
         """Export the fit as C99 code with a test program, or its mean as a CasADi function.
 
         The C code requires only libm. It maps (q, q̇, τ, closed contacts) to the mean and covariance of every
-        quantity, and to the Jacobians of the mean. The CasADi function returns the mean, with exact
-        derivatives of any order.
+        quantity, and to the Jacobians of the mean. With q̈, it estimates the forces of all contacts, as
+        `contact_force` does. The CasADi function returns the mean, with exact derivatives of any order.
 
         Args:
             path: the folder to create.
@@ -353,6 +362,8 @@ class StructuredFit(FittedModel):
                 in C code if there are more than 1700.
             wrench: frame and components of an external wrench to estimate from the state and accelerations.
             dtype: precision of the C code, `torch.float64` or `torch.float32`.
+            jacobians: whether C code includes Jacobians. For a legged robot, they are most of the code.
+            online: whether C code can learn online. If not, code for uncertain inertia is faster.
 
         Returns:
             The folder, the growth of error bars caused by a reduced-rank covariance, and the errors caused by
@@ -366,23 +377,32 @@ class StructuredFit(FittedModel):
             DestinationError: the folder cannot be written, or contains other files.
             MissingDependencyError: CasADi is not installed.
         """
-        model = self._exported(functions, wrench, dtype)
+        model = self._exported(functions, wrench, dtype, jacobians, online)
         return write_export(model, self, self.training, path, language, name)
 
-    def compiled(self, *, functions: int | None = None, wrench: WrenchFrame | None = None) -> CompiledFit:
+    def compiled(
+        self,
+        *,
+        functions: int | None = None,
+        wrench: WrenchFrame | None = None,
+        jacobians: bool = True,
+        online: bool = True,
+    ) -> CompiledFit:
         """Compile the fit to a fast predictor in C with the local compiler.
 
         Args:
             functions: number of basis functions in a reduced-rank covariance, which is never smaller than the
                 full covariance. `None` uses all of them.
             wrench: the frame and components that `external_wrench` estimates.
+            jacobians: whether to compile `jacobian` and `linearize`, a minute for a legged robot.
+            online: whether to compile `update`. Without it, predictions with uncertain inertia are faster.
 
         Raises:
             ModelError: a prior, kernel or contact cannot be exported to C, or the posterior is too large.
             UnknownNameError: the frame does not exist.
             MissingDependencyError: there is no C++ compiler.
         """
-        return CompiledFit(self._exported(functions, wrench))
+        return CompiledFit(self._exported(functions, wrench, jacobians=jacobians, online=online))
 
     def beyond(self, qd: Tensor, tau: Tensor) -> Tensor | None:
         """Return how far speeds and torques exceed the training data, `(*batch, nq)`, in standard deviations

@@ -6,8 +6,9 @@ static double dot(const double *restrict a, const double *restrict b, int n) {
   for (; i + 8 <= n; i += 8)
     for (int lane = 0; lane < 8; ++lane) lanes[lane] += a[i + lane] * b[i + lane];
   for (; i < n; ++i) sum += a[i] * b[i];
-  for (int lane = 0; lane < 8; ++lane) sum += lanes[lane];
-  return sum;
+  for (int half = 4; half > 0; half /= 2)
+    for (int lane = 0; lane < half; ++lane) lanes[lane] += lanes[lane + half];
+  return sum + lanes[0];
 }
 
 /* y = x^T C for C with n rows and m columns */
@@ -46,22 +47,49 @@ typedef struct {
   touching contact[SOME(CONTACTS)];
   double x[SOME(INPUTS)], phi[SOME(FEATURES)]; /* standardized inputs and features of the priors */
   double expected[NQ];                         /* force that learned terms are expected to have */
+  double pressing[SOME(ROWS)];                 /* lambda that multiplies errors of friction coefficients */
 } equations;
 
-/* the lower Cholesky factor G of M = G G^T `(n, n)`, and K = G^-1; returns 0 unless M is positive definite */
-static int inverse_factor(const double *restrict M, int n, double *restrict G, double *restrict K) {
-  for (int i = 0; i < n; ++i)
-    for (int j = 0; j <= i; ++j) {
-      double sum = M[i * n + j];
-      for (int k = 0; k < j; ++k) sum -= G[i * n + k] * G[j * n + k];
-      if (i == j && !(sum > 0.0)) return 0;
-      G[i * n + j] = i == j ? sqrt(sum) : sum / G[j * n + j];
+/* [M, R] becomes [G^T, G^-1 R], with the lower Cholesky factor G of M = G G^T `(n, n)`, in rows of `width` numbers; returns 0
+ * unless M is positive definite. Only the upper triangle of M is read. Loops run along rows, so that compilers use vector
+ * registers */
+static int eliminate(double *U, int n, int width) {
+  for (int k = 0; k < n; ++k) {
+    double *restrict pivot = U + k * width;
+    const double inverse_size = 1.0 / sqrt(pivot[k]);
+    if (!(pivot[k] > 0.0)) return 0;
+    for (int j = k; j < width; ++j) pivot[j] *= inverse_size;
+    for (int i = k + 1; i < n; ++i) {
+      double *restrict below = U + i * width;
+      const double share = pivot[i];
+      for (int j = i; j < width; ++j) below[j] -= share * pivot[j];
     }
-  for (int j = 0; j < n; ++j)
-    for (int i = 0; i < n; ++i) {
-      double sum = i == j ? 1.0 : 0.0;
-      for (int k = j; k < i; ++k) sum -= G[i * n + k] * K[k * n + j];
-      K[i * n + j] = i < j ? 0.0 : sum / G[i * n + i];
+  }
+  return 1;
+}
+
+/* K = G^-1 `(n, n)` with the lower Cholesky factor G of M = G G^T, and V = K^T K = M^-1 unless it is NULL; returns 0 unless M
+ * is positive definite */
+static int inverse(const double *restrict M, int n, double *restrict K, double *restrict V) {
+  double U[MOST_UNKNOWNS * MOST_UNKNOWNS]; /* G^T */
+  memcpy(U, M, sizeof(double) * n * n);
+  if (!eliminate(U, n, n)) return 0;
+  /* row k of K = (1 - sum of G_ki K_i) / G_kk */
+  for (int k = 0; k < n; ++k) {
+    double *restrict row = K + k * n;
+    const double inverse_size = 1.0 / U[k * n + k];
+    for (int j = 0; j < n; ++j) row[j] = j == k ? 1.0 : 0.0;
+    for (int i = 0; i < k; ++i) {
+      const double *restrict above = K + i * n, share = U[i * n + k];
+      for (int j = 0; j <= i; ++j) row[j] -= share * above[j];
+    }
+    for (int j = 0; j <= k; ++j) row[j] *= inverse_size;
+  }
+  if (V) memset(V, 0, sizeof(double) * n * n);
+  for (int k = 0; V && k < n; ++k)
+    for (int i = 0; i <= k; ++i) {
+      const double *restrict row = K + k * n, share = row[i];
+      for (int j = 0; j <= k; ++j) V[i * n + j] += share * row[j];
     }
   return 1;
 }
@@ -123,7 +151,7 @@ static void motion_under(const equations *restrict e, const double *restrict Q, 
 
 static int assemble(const double *restrict q, const double *restrict qd, const double *restrict tau,
                     const unsigned char *restrict closed, equations *restrict e) {
-  double sine[NQ], cosine[NQ], out[MECHANICS], G[NQ * NQ], K[NQ * NQ], Q[NQ];
+  double sine[NQ], cosine[NQ], out[MECHANICS], K[NQ * NQ], Q[NQ];
   const double *next = out + NQ * NQ + 3 * NQ;
   (void)closed;
   for (int i = 0; i < NQ; ++i) sine[i] = sin(q[i]), cosine[i] = cos(q[i]);
@@ -137,13 +165,7 @@ static int assemble(const double *restrict q, const double *restrict qd, const d
   memcpy(e->phi, next, sizeof(double) * FEATURES), next += FEATURES;
   memcpy(e->expected, next, sizeof e->expected);
   for (int i = 0; i < NQ; ++i) Q[i] = e->Q_C[i] + e->Q_G[i] + e->Q_D[i] + TORQUE_SCALE[i] * tau[i];
-  if (!inverse_factor(&e->M[0][0], NQ, G, K)) return 0;
-  for (int i = 0; i < NQ; ++i)
-    for (int j = 0; j <= i; ++j) {
-      double sum = 0.0;
-      for (int k = i; k < NQ; ++k) sum += K[k * NQ + i] * K[k * NQ + j];
-      e->M_inv[i][j] = e->M_inv[j][i] = sum;
-    }
+  if (!inverse(&e->M[0][0], NQ, K, &e->M_inv[0][0])) return 0;
   memcpy(e->H, e->M_inv, sizeof e->H);
 #if CONTACTS > 0
   {
@@ -225,6 +247,16 @@ static int friction_gain(const equations *e, double *restrict gain) {
     for (int r = 0; r < ROWS; ++r) gain[j * ROWS + r] = X[r][ROWS + j] / X[r][r];
   return 1;
 }
+
+/* the multiplier under known and expected forces with friction of contacts */
+static void pressing_forces(const double *restrict tau, const double *restrict gain, equations *restrict e) {
+  double Q[NQ], qdd[NQ], load[ROWS];
+  for (int j = 0; j < NQ; ++j)
+    Q[j] = e->Q_C[j] + e->Q_G[j] + e->Q_D[j] + TORQUE_SCALE[j] * tau[j] + e->expected[j];
+  motion_under(e, Q, qdd, load);
+  for (int j = 0; j < NQ; ++j) Q[j] += dot(gain + j * ROWS, load, ROWS);
+  motion_under(e, Q, qdd, e->pressing);
+}
 #endif
 
 /* ---- every quantity as an affine map of the forces: z = B_Q Q + B_z Q_z + B_N Q_N + B_F Q_F + o ---- */
@@ -302,44 +334,28 @@ typedef struct {
   double mean[COMPONENTS], prior[COMPONENTS]; /* posterior mean of f, and its prior variance */
   double rest[COMPONENTS];                    /* diagonal part D of the posterior covariance */
   double E[COMPONENTS][NQ];                   /* generalized force of each f */
-  double T[COMPONENTS][RANK];                 /* the covariance is D + T T^T or, with SIGN -1, D - T T^T */
+  double V[FUNCTIONS];                        /* whitened functions of all components */
   const forcegp_learned *learned;             /* the online state, or NULL */
   const double *folded;                       /* weights of kernels and features; NULL means those of the mean */
-  double *functions;                          /* output for the whitened functions, or NULL */
 } latent;
-
-/* row = V^T C, the functions V of a component in the columns from `first` on */
-static void root_row(const double *restrict C, const double *restrict V, int n, int first, double *restrict row) {
-  for (int c = 0; c < first; ++c) row[c] = 0.0;
-  combine(C, V, n, RANK - first, row + first);
-}
 
 /* posterior of component k from its functions V: m covariances k(x, Z), with prior variance `variance`, and
  * features phi(x) */
 static void component(const double *restrict V, int m, int features, double variance, const double *restrict weights,
-                      const double *restrict whitening, int kept, const double *restrict C, int first, int spread,
-                      int k, latent *restrict f) {
-  const double more = dot(V + m, V + m, features), *functions = V;
-  double white[MOST_FUNCTIONS];
+                      const double *restrict whitening, int kept, int spread, int k, latent *restrict f) {
+  const double more = SIGN > 0.0 ? 0.0 : dot(V + m, V + m, features);
+  double *restrict white = f->V + FUNCTION[k];
   if (f->folded) weights = f->folded + FOLDED[k];
   f->mean[k] = dot(V, weights, m + features);
-  f->prior[k] = f->rest[k] = SIGN > 0.0 ? variance : variance + more; /* squares of features do not cancel */
+  f->prior[k] = f->rest[k] = variance + more; /* squares of features do not cancel */
   if (!spread) return;
   if (whitening) { /* D = k - |R^T k(Z, x)|^2, the residual variance given the support points */
     combine(whitening, V, m, kept, white);
-    memcpy(white + kept, V + m, sizeof(double) * features);
     f->rest[k] = fmax(variance - dot(white, white, kept), 0.0);
-    functions = white, m = kept;
-  }
-#if ONLINE
-  if (f->functions) memcpy(f->functions + first, functions, sizeof(double) * (m + features));
-  for (int j = 0; f->learned && j < RANK; ++j) { /* C = K^T */
-    const int n = j < first ? 0 : j < first + m + features ? j - first + 1 : m + features;
-    f->T[k][j] = dot(f->learned->root + (long)j * (j + 1) / 2 + first, functions, n);
-  }
-  if (f->learned) return;
-#endif
-  root_row(C, functions, m + features, first, f->T[k]);
+  } else
+    memcpy(white, V, sizeof(double) * (kept = m));
+  memcpy(white + kept, V + m, sizeof(double) * features);
+  if (INDEPENDENT[k] && !f->learned) f->rest[k] += dot(white, white, kept + features);
 }
 
 /* HELPERS: each is included only if a prior uses it */
@@ -376,6 +392,7 @@ static int against(const equations *restrict e, const double *restrict qd, int c
   const touching *at = &e->contact[c];
   const double square = dot(at->sliding, at->sliding, 3), size = sqrt(square + smoothing * smoothing);
   const double rate = dot(at->turning, qd, NQ), spin = sqrt(rate * rate + torsion_smoothing * torsion_smoothing);
+  const double fading = exp(-square / (stribeck_speed * stribeck_speed));
   double push[NQ], relief = 1.0, load;
   int loaded = 0;
   memset(E, 0, sizeof(double[NQ]) * count);
@@ -389,7 +406,7 @@ static int against(const equations *restrict e, const double *restrict qd, int c
   for (int k = 0; k < count; ++k) {
     loaded |= terms[k] >= COULOMBS;
     for (int j = 0; j < NQ; ++j) {
-      const double dry = push[j] / size, fading = exp(-square / (stribeck_speed * stribeck_speed));
+      const double dry = push[j] / size;
       E[k][j] = terms[k] == VISCOUS    ? push[j]
                 : terms[k] == DRY      ? dry
                 : terms[k] == COULOMBS ? load * dry
@@ -400,20 +417,14 @@ static int against(const equations *restrict e, const double *restrict qd, int c
   return !loaded || relief > 0.0;
 }
 
-/* E = d(mu u)/d(log mu, log eps) lambda, with the multiplier under known and expected forces and this friction */
-static void friction_error(const equations *restrict e, const double *restrict tau, const double *restrict gain, int c,
-                           double mu, double smoothing, double (*restrict E)[NQ]) {
+/* E = d(mu u)/d(log mu, log eps) lambda, with lambda under known and expected forces and friction of contacts */
+static void friction_error(const equations *restrict e, int c, double mu, double smoothing, double (*restrict E)[NQ]) {
   const touching *at = &e->contact[c];
   const double square = dot(at->sliding, at->sliding, 3), fading = smoothing * smoothing / (square + smoothing * smoothing);
-  double u[NQ], Q[NQ], qdd[NQ], load[SOME(ROWS)], multiplier[SOME(ROWS)];
+  double u[NQ];
   against_sliding(at, smoothing, u);
-  for (int j = 0; j < NQ; ++j)
-    Q[j] = e->Q_C[j] + e->Q_G[j] + e->Q_D[j] + TORQUE_SCALE[j] * tau[j] + e->expected[j];
-  motion_under(e, Q, qdd, load);
-  for (int j = 0; j < NQ; ++j) Q[j] += dot(gain + j * ROWS, load, ROWS);
-  motion_under(e, Q, qdd, multiplier);
   for (int j = 0; j < NQ; ++j) {
-    E[0][j] = e->closed[c] ? mu * multiplier[c] * u[j] : 0.0;
+    E[0][j] = e->closed[c] ? mu * e->pressing[c] * u[j] : 0.0;
     E[1][j] = -fading * E[0][j];
   }
 }
@@ -471,14 +482,14 @@ static void matern52(double *restrict u, int m) {
 /* PRIORS */
 
 #if defined INERTIAL || defined PAYLOAD
-/* E = -[Y(q, qdd, qd), diag qdd] S for errors of inertial parameters of links, followed by those of drives */
-static void inertial(const double *restrict q, const double *restrict qd, const double *restrict qdd, int start, int column,
-                     int count, const double *restrict scale, latent *restrict f) {
+/* E = -[Y(q, qdd, qd), diag qdd] S in the given columns, for errors of inertial parameters of links and of drives */
+static void inertial(const double *restrict q, const double *restrict qd, const double *restrict qdd, int start, int count,
+                     const int *restrict column, const double *restrict units, latent *restrict f) {
   double sine[NQ], cosine[NQ], Y[10 * NQ + NQ][NQ] = {{0.0}};
   for (int i = 0; i < NQ; ++i) sine[i] = sin(q[i]), cosine[i] = cos(q[i]), Y[10 * NQ + i][i] = qdd[i];
   regressor(q, qd, qdd, sine, cosine, Y[0]);
   for (int k = 0; k < count; ++k)
-    for (int j = 0; j < NQ; ++j) f->E[start + k][j] = -scale[k] * Y[column + k][j];
+    for (int j = 0; j < NQ; ++j) f->E[start + k][j] = -units[k] * Y[column[k]][j];
 }
 #endif
 
@@ -500,10 +511,10 @@ static void inertial_errors(const double *q, const double *qd, const double *tau
   }
 #endif
 #ifdef PAYLOAD
-  inertial(q, qd, PAYLOAD_MEASURED && qdd ? qdd : e->qdd, PAYLOAD, PAYLOAD_COLUMN, 4, PAYLOAD_UNITS, f);
+  inertial(q, qd, PAYLOAD_MEASURED && qdd ? qdd : e->qdd, PAYLOAD, 4, PAYLOAD_COLUMN, PAYLOAD_UNITS, f);
 #endif
 #ifdef INERTIAL
-  inertial(q, qd, qdd ? qdd : e->qdd, INERTIAL, 0, INERTIAL_COLUMNS, INERTIAL_SCALE, f);
+  inertial(q, qd, qdd ? qdd : e->qdd, INERTIAL, INERTIAL_COUNT, INERTIAL_COLUMN, INERTIAL_UNITS, f);
 #endif
 }
 
@@ -525,49 +536,158 @@ static void read_mean(const affine *restrict z, const latent *restrict f, const 
               dot(z->B_N[a], force[CONSTRAINT], NQ) + dot(z->B_F[a], force[JOINT_FRICTION], NQ);
 }
 
-/* W = B E, which maps the latent forces to quantities */
-static void operators(const affine *restrict z, const latent *restrict f, int size, double (*restrict W)[COMPONENTS]) {
-  for (int a = 0; a < size; ++a)
-    for (int k = 0; k < COMPONENTS; ++k) {
+/* copy the lower triangle to the upper one */
+static void mirror(double *restrict C, int n) {
+  for (int a = 0; a < n; ++a)
+    for (int b = a + 1; b < n; ++b) C[a * n + b] = C[b * n + a];
+}
+
+/* W^T for W = B E, which maps the latent forces to quantities, `(COMPONENTS, size)` */
+static void operators(const affine *restrict z, const latent *restrict f, int size, double *restrict W) {
+  for (int k = 0; k < COMPONENTS; ++k)
+    for (int a = 0; a < size; ++a) {
       const double *B = TARGET[k] == CONTACT ? z->B_z[a] : TARGET[k] == CONSTRAINT ? z->B_N[a] : z->B_Q[a];
-      W[a][k] = dot(B, f->E[k], NQ) + (IS_FRICTION[k] ? dot(z->B_F[a], f->E[k], NQ) : 0.0);
+      W[k * size + a] = dot(B, f->E[k], NQ) + (IS_FRICTION[k] ? dot(z->B_F[a], f->E[k], NQ) : 0.0);
     }
 }
 
-/* a column p = B_z J_E^T (1 - n n^T) sqrt(sigma^2 + s^2 k) for the tangential force of a contact along world axis x,
- * which is no function of the state, with k = exp(-(v/v_s)^2); zero while the contact is open */
+/* sigma^2 + s^2 exp(-(v/v_s)^2), the variance of the tangential force of a contact that is no function of the state */
+static double tip_variance(const equations *restrict e, int contact) {
+  const touching *at = &e->contact[contact];
+  const double *tip = TIP[contact];
+  return tip[0] + tip[1] * exp(-dot(at->sliding, at->sliding, 3) / (tip[2] * tip[2]));
+}
+
+/* a column p = B_z J_E^T (1 - n n^T) std for this force along world axis x; zero while the contact is open or if the size of
+ * the force is not learned */
 static void contact_unknown(const affine *restrict z, const equations *restrict e, int contact, int x, int size,
                             double *restrict p) {
   const touching *at = &e->contact[contact];
-  const double slow = dot(at->sliding, at->sliding, 3) / (TIP_SPEED[contact] * TIP_SPEED[contact]);
-  const double std = e->closed[contact] ? sqrt(SLIDE_VARIANCE[contact] + REST_VARIANCE[contact] * exp(-slow)) : 0.0;
+  const double std = TIP_LEARNED[contact] && e->closed[contact] ? sqrt(tip_variance(e, contact)) : 0.0;
   for (int a = 0; a < size; ++a) p[a] = std * dot(z->B_z[a], at->sliding_jacobian[x], NQ);
 }
 
-/* W D W^T + W T T^T W^T with W = B E, plus the variance of unknown forces; 0 if a variance is below rounding error */
+/* up to four rows of C from the column `start` on, each times V and W^T of its component, so that passes over `root` are few */
+typedef struct {
+  const double *row[4], *W[4];
+  double V[4];
+  int start, count;
+} pending;
+
+/* to += sum of by_t r_t for n numbers, a multiple of LANES */
+static void add_four(int n, double by0, double by1, double by2, double by3, const double *restrict r0,
+                     const double *restrict r1, const double *restrict r2, const double *restrict r3, double *restrict to) {
+  for (int c = 0; c < n; c += LANES)
+    for (int lane = c; lane < c + LANES; ++lane) to[lane] += by0 * r0[lane] + by1 * r1[lane] + by2 * r2[lane] + by3 * r3[lane];
+}
+
+static void add_rows(pending *restrict p, int size, int width, double (*restrict root)[PADDED]) {
+  static const double none[PADDED + SIZE_OF_ALL] = {0.0};
+  const int count = p->count, start = p->start;
+  if (count == 0) return;
+  for (int t = count; t < 4; ++t) p->row[t] = p->W[t] = none, p->V[t] = 0.0;
+  for (int a = 0; a < size; ++a) {
+    const double w0 = p->W[0][a], w1 = p->W[1][a], w2 = p->W[2][a], w3 = p->W[3][a];
+    if (w0 != 0.0 || w1 != 0.0 || w2 != 0.0 || w3 != 0.0)
+      add_four(width - start, p->V[0] * w0, p->V[1] * w1, p->V[2] * w2, p->V[3] * w3, p->row[0], p->row[1], p->row[2],
+               p->row[3], root[a] + start);
+  }
+  p->count = 0;
+}
+
+/* root = W T `(size, RANK)` for W^T `(COMPONENTS, size)`, with the row T_k = V^T C of each component. Rows of C are used
+ * directly for a component with one function, or with one nonzero entry of W. Returns the number of columns, and the
+ * number of nonzero entries of W for each component */
+static int carry(const latent *restrict f, const double *restrict W, int size, double (*restrict root)[PADDED],
+                 int *restrict uses) {
+  pending rows;
+  const int width = f->learned ? PADDED : WIDTH;
+  rows.count = rows.start = 0;
+  for (int a = 0; a < size; ++a) memset(root[a], 0, sizeof(double) * width);
+  for (int k = 0; k < COMPONENTS; ++k) {
+    const double *V = f->V + FUNCTION[k], *w = W + (long)k * size;
+    const int n = FUNCTION[k + 1] - FUNCTION[k], start = f->learned ? FUNCTION[k] / LANES * LANES : START(k);
+    double T[PADDED];
+    int nonzero = 0, whole;
+    uses[k] = 0;
+    for (int a = 0; a < size; ++a) uses[k] += w[a] != 0.0;
+    for (int i = 0; uses[k] && i < n; ++i) nonzero |= V[i] != 0.0;
+    if (!nonzero || (INDEPENDENT[k] && !f->learned)) continue;
+    whole = f->learned || (n > 1 && uses[k] > 1);
+    if (whole || n > 1 || start != rows.start) add_rows(&rows, size, width, root);
+    if (whole && !f->learned) combine(ROOTS[k], V, n, width - start, T);
+#if ONLINE
+    if (f->learned) memset(T, 0, sizeof T);
+    for (int j = FUNCTION[k], own = 1; f->learned && j < RANK; ++j, own += own < n) /* C = K^T */
+      T[j - start] = dot(f->learned->root + (long)j * (j + 1) / 2 + FUNCTION[k], V, own);
+#endif
+    for (int i = 0; i < (whole ? 1 : n); ++i) {
+      rows.row[rows.count] = whole ? T : ROOTS[k] + (long)i * (width - start);
+      rows.W[rows.count] = w, rows.V[rows.count] = whole ? 1.0 : V[i], rows.start = start;
+      if (++rows.count == 4 || whole) add_rows(&rows, size, width, root);
+    }
+    if (n > 1) add_rows(&rows, size, width, root);
+  }
+  add_rows(&rows, size, width, root);
+  return width;
+}
+
+/* dots = a^T b for four rows b of n numbers, a multiple of LANES */
+static void four_dots(const double *restrict a, double (*restrict b)[PADDED], int n, double *restrict dots) {
+  double lanes[4][LANES] = {{0.0}};
+  for (int c = 0; c < n; c += LANES)
+    for (int row = 0; row < 4; ++row)
+      for (int lane = 0; lane < LANES; ++lane) lanes[row][lane] += a[c + lane] * b[row][c + lane];
+  for (int row = 0; row < 4; ++row) {
+    for (int half = LANES / 2; half > 0; half /= 2)
+      for (int lane = 0; lane < half; ++lane) lanes[row][lane] += lanes[row][lane + half];
+    dots[row] = lanes[row][0];
+  }
+}
+
+/* the lower triangle of W D W^T + W T T^T W^T for W^T `(COMPONENTS, size)`; 0 if a variance is below rounding error */
+static int learned_covariance(const latent *restrict f, const double *restrict W, int size, double *restrict covariance) {
+  double root[SIZE_OF_ALL + 3][PADDED], before[SIZE_OF_ALL] = {0.0};
+  int uses[COMPONENTS], resolved = 1;
+  const int width = carry(f, W, size, root, uses);
+  for (int a = 0; a < 3; ++a) memset(root[size + a], 0, sizeof(double) * width);
+  for (int a = 0; a < size; ++a)
+    for (int b = 0; b <= a; b += 4) {
+      double dots[4];
+      four_dots(root[a], root + b, width, dots);
+      for (int i = 0; i < 4 && b + i <= a; ++i) covariance[a * size + b + i] = SIGN * dots[i];
+    }
+  for (int k = 0; k < COMPONENTS; ++k) {
+    const double *w = W + (long)k * size;
+    if (!uses[k] || (f->prior[k] == 0.0 && f->rest[k] == 0.0)) continue;
+    for (int a = 0; a < size; ++a) {
+      before[a] += w[a] * w[a] * f->prior[k];
+      for (int b = 0; w[a] != 0.0 && b <= a; ++b) covariance[a * size + b] += w[a] * f->rest[k] * w[b];
+    }
+  }
+  for (int a = 0; a < size; ++a) resolved &= !(covariance[a * size + a] < SMALLEST_FRACTION * before[a]);
+  return resolved;
+}
+
+/* that of W = B E, plus the variance of unknown forces */
 static int read_covariance(const affine *restrict z, const equations *restrict e, const latent *restrict f,
                            const double *restrict unknown, int size, double *restrict covariance) {
-  double root[SIZE_OF_ALL][RANK], W[SIZE_OF_ALL][COMPONENTS], scaled[COMPONENTS], p[SIZE_OF_ALL];
-  int resolved = 1;
+  double W[COMPONENTS * SIZE_OF_ALL], p[SIZE_OF_ALL];
+  int resolved;
   operators(z, f, size, W);
-  for (int a = 0; a < size; ++a) combine(&f->T[0][0], W[a], COMPONENTS, RANK, root[a]);
+  resolved = learned_covariance(f, W, size, covariance);
   for (int a = 0; a < size; ++a) {
-    double before = 0.0, carried[NQ];
-    for (int k = 0; k < COMPONENTS; ++k) scaled[k] = W[a][k] * f->rest[k], before += W[a][k] * W[a][k] * f->prior[k];
+    double carried[NQ];
     for (int j = 0; j < NQ; ++j) carried[j] = (z->B_Q[a][j] + z->B_F[a][j]) * unknown[j];
-    for (int b = 0; b <= a; ++b) {
-      const double learned = SIGN * dot(root[a], root[b], RANK) + dot(scaled, W[b], COMPONENTS);
-      if (a == b && learned < SMALLEST_FRACTION * before) resolved = 0;
-      covariance[a * size + b] = learned + dot(carried, z->B_Q[b], NQ) + dot(carried, z->B_F[b], NQ);
-    }
+    for (int b = 0; b <= a; ++b)
+      covariance[a * size + b] += dot(carried, z->B_Q[b], NQ) + dot(carried, z->B_F[b], NQ);
   }
   for (int k = 0; k < 3 * CONTACTS; ++k) {
     contact_unknown(z, e, k / 3, k % 3, size, p);
     for (int a = 0; a < size; ++a)
       for (int b = 0; b <= a; ++b) covariance[a * size + b] += p[a] * p[b];
   }
-  for (int a = 0; a < size; ++a)
-    for (int b = a + 1; b < size; ++b) covariance[a * size + b] = covariance[b * size + a];
+  mirror(covariance, size);
   return resolved;
 }
 
@@ -597,6 +717,7 @@ static int prepare(const double *q, const double *qd, const double *tau, const u
   if (!assemble(q, qd, tau, closed, e)) return FORCEGP_NO_INERTIA;
 #if COULOMB > 0
   if (!friction_gain(e, gain)) return FORCEGP_JAMMED;
+  pressing_forces(tau, gain, e);
 #endif
   return 0;
 }
@@ -615,7 +736,7 @@ static int evaluate(const forcegp_learned *learned, const double *q, const doubl
   if (status) return status;
   distance(qd, tau, s->far);
   expected_force(&s->e, tau, s->prior_mean);
-  s->f.learned = learned, s->f.folded = NULL, s->f.functions = NULL;
+  s->f.learned = learned, s->f.folded = NULL;
 #if ONLINE
   if (learned) s->f.folded = learned->folded;
 #endif

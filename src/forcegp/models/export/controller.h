@@ -53,21 +53,10 @@ int forcegp_predict_learned(const forcegp_learned *learned, long count, const do
                             const double *tau, const unsigned char *closed, unsigned quantities, int noise, double *mean,
                             double *covariance, double *beyond);
 
-@online@@wrench@/* Mass matrix M, and the rows of A for all contacts; three planes through a tool give its Jacobian. */
+@online@@wrench@@contact_force@/* Mass matrix M, and the rows of A for all contacts; three planes through a tool give its Jacobian. */
 int forcegp_equations(const double *q, const double *qd, double *M, double *A);
 
-/* Posterior mean and its Jacobian for qdd, multiplier, contact force and joint friction, including undetermined ones.
- *
- * jacobian     d x 3 FORCEGP_JOINTS numbers, row by row: derivatives with respect to q, then qd, then tau
- */
-int forcegp_jacobian(const double *q, const double *qd, const double *tau, const unsigned char *closed,
-                     unsigned quantities, double *mean, double *jacobian);
-
-/* The same at `count` states, one after the other; returns the first error. */
-int forcegp_jacobian_many(long count, const double *q, const double *qd, const double *tau, const unsigned char *closed,
-                          unsigned quantities, double *mean, double *jacobian);
-
-/* Free acceleration M^-1 (force + Q_C + Q_G) of the robot alone. */
+@jacobian@/* Free acceleration M^-1 (force + Q_C + Q_G) of the robot alone. */
 void forcegp_forward_dynamics(const double *q, const double *qd, const double *force, double *qdd);
 
 #ifdef __cplusplus

@@ -20,8 +20,8 @@ from forcegp.models.export.casadi_function import write_casadi
 from forcegp.models.export.library import CompiledFit
 from forcegp.models.export.model import ExportedModel
 from forcegp.models.export.source import READ, c_source, template
-from forcegp.models.external_wrench import LearnedForces, external_wrench
-from forcegp.models.prediction import Predictor
+from forcegp.models.external_wrench import LearnedForces, contact_force, external_wrench
+from forcegp.models.prediction import Prediction, Predictor
 
 LANGUAGES = ("c", "casadi")
 STATES, LOSS_STATES = 16, 200
@@ -179,11 +179,14 @@ def _reference(model: ExportedModel, fit: Predictor, name: str) -> str:
     lines.append(f"static const double TOLERANCE = {tolerance!r}, ZERO = {ZERO!r};")
     flags = torch.nn.functional.pad(active, (0, int(not active.shape[1]))).int()
     tables = {"q": q, "qd": qd, "tau": tau, "mean": read.mean, "covariance": read.covariance.flatten(1)}
-    along = fit.linearize(q, qd, tau, active=active)
-    both = [torch.stack(along[at : at + 3], dim=-2).flatten(1) for at in (1, 5)]
-    tables["slopes"] = torch.cat(both, dim=1)
+    tables["slopes"] = q.new_zeros(len(q), 1)
+    if model.jacobians:
+        along = fit.linearize(q, qd, tau, active=active)
+        both = [torch.stack(along[at : at + 3], dim=-2).flatten(1) for at in (1, 5)]
+        tables["slopes"] = torch.cat(both, dim=1)
+        lines.append("#define JACOBIANS")
     lines.append(f"enum {{ SLOPES = {tables['slopes'].shape[1]} }};")
-    if model.wrench is not None:
+    if model.wrench is not None or model.reads_contacts:
         # The accelerations are within the model's errors, since rounding errors grow with the wrench.
         std = read.covariance.diagonal(dim1=-2, dim2=-1).clamp(min=0.0).sqrt()
         far = torch.linspace(-2.0, 2.0, len(q), dtype=q.dtype)[:, None]
@@ -192,9 +195,15 @@ def _reference(model: ExportedModel, fit: Predictor, name: str) -> str:
         time, header = torch.arange(len(q), dtype=q.dtype), DataHeader(ordered=False)
         data = Dataset(time, q, qd, tau, qdd, model.system.robot.joint_names, contact=closed, header=header)
         assert isinstance(fit, LearnedForces)
-        wrench = external_wrench(fit, data, model.wrench, "acceleration")
-        assert wrench.covariance is not None
-        tables |= {"qdd": qdd, "wrench": wrench.mean, "wrench_covariance": wrench.covariance.flatten(1)}
+        tables["qdd"], read = qdd, dict[str, Prediction]()
+        if model.wrench is not None:
+            read["wrench"] = external_wrench(fit, data, model.wrench, "acceleration")
+        if model.reads_contacts:
+            read["contact_force"] = contact_force(fit, data, None, None)
+            lines.append("#define CONTACT_FORCE")
+        for key, x in read.items():
+            assert x.covariance is not None
+            tables |= {key: x.mean, f"{key}_covariance": x.covariance.flatten(1)}
     for key, x in {**tables, "closed": flags}.items():
         kind = {"closed": "unsigned char"}.get(key, real if key in ("q", "qd", "tau", "qdd") else "double")
         rows = ",\n  ".join("{" + ", ".join(map(repr, row)) + "}" for row in x.tolist()).replace("nan", "NAN")

@@ -8,7 +8,7 @@ import dataclasses
 from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -17,10 +17,11 @@ from forcegp.constraints import ConstrainedSystem
 from forcegp.errors import ForceGPError, ModelError, NumericalError, ShapeError, check_name
 from forcegp.forces.posterior import LOW
 from forcegp.forces.quantities import FlatStates, ForceField, ForceLinearization, flat_states, hidden_forces
+from forcegp.forces.unknowns import AXES
 from forcegp.models.export.mean import DIFFERENTIATED
 from forcegp.models.export.model import ExportedModel
 from forcegp.models.export.source import READ, c_source
-from forcegp.models.external_wrench import ExternalWrench
+from forcegp.models.external_wrench import ExternalWrench, parts_of_contacts, surface_contacts
 from forcegp.models.prediction import Prediction, Predictor, in_pieces
 from forcegp.native import load_library
 
@@ -62,10 +63,14 @@ class CompiledFit(Predictor):
         self.library = load_library(source.replace(f'#include "{NAME}.h"\n', header), level="-O3")
         for name in FUNCTIONS if model.online else list(FUNCTIONS)[:1]:
             getattr(self.library, f"forcegp_{name}").argtypes = [POINTER, *FUNCTIONS[name]]
-        self._many, self._slopes = self.library.forcegp_predict_learned, self.library.forcegp_jacobian_many
-        self._slopes.argtypes = [ctypes.c_long, *[POINTER] * 4, ctypes.c_uint, *[POINTER] * 2]
+        self._many = self.library.forcegp_predict_learned
+        if model.jacobians:
+            arguments = [ctypes.c_long, *[POINTER] * 4, ctypes.c_uint, *[POINTER] * 2]
+            self.library.forcegp_jacobian_many.argtypes = arguments
         if model.wrench is not None:
             self.library.forcegp_external_wrench.argtypes = [POINTER, ctypes.c_long, *[POINTER] * 10]
+        if model.reads_contacts:
+            self.library.forcegp_contact_force.argtypes = [POINTER, ctypes.c_long, *[POINTER] * 9]
         self._learned: Tensor | None = None
         self._memory: int | None = None
         self._sizes = {name: self.library.forcegp_size(1 << bit) for bit, name in enumerate(READ)}
@@ -170,7 +175,7 @@ class CompiledFit(Predictor):
         if not self.model.online:
             raise ModelError(
                 "this fit cannot learn online in C",
-                expected="sparse inference with all functions, without state noise, learned inertia or delay",
+                expected="sparse inference with all functions, without state noise or delay, and online=True",
                 hint="call the `update` method of the fit",
             )
         parts = self.model.parts()
@@ -254,9 +259,15 @@ class CompiledFit(Predictor):
 
         Raises:
             UnknownNameError: the quantity does not exist.
-            ModelError: friction jams a contact, or the fit was updated in C.
+            ModelError: the fit was compiled without Jacobians or updated in C, or friction jams a contact.
             NumericalError: the closed contacts are not independent.
         """
+        if not self.model.jacobians:
+            raise ModelError(
+                "this fit was compiled without Jacobians",
+                expected="fit.compiled(jacobians=True)",
+                got="fit.compiled(jacobians=False)",
+            )
         if self._learned is not None:
             raise ModelError(
                 "samples added in C do not change the Jacobian", hint="update the fit, and compile it again"
@@ -268,7 +279,7 @@ class CompiledFit(Predictor):
         arrays, batch = self._states(q, qd, tau, active)
         mean, slopes = self._new(*batch, read.size), self._new(*batch, read.size, 3, nq)
         pointers = [None if x is None else x.data_ptr() for x in (*arrays, mean, slopes)]
-        status = self._slopes(batch.numel(), *pointers[:4], read.bits, *pointers[4:])
+        status = self.library.forcegp_jacobian_many(batch.numel(), *pointers[:4], read.bits, *pointers[4:])
         if status:
             raise self._error(status, q, qd, tau, active)
         if read.order is not None:
@@ -323,33 +334,80 @@ class CompiledFit(Predictor):
         mean, _, _, slopes = self._wrench((q, qd, tau, qdd), active, qdd_std, True)
         return WrenchJacobian(mean, *slopes.unbind(-2))
 
-    def _wrench(
-        self, state: Sequence[Tensor], active: Tensor | None, qdd_std: Tensor | None, differentiate: bool
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Return mean, covariance, distance beyond the training data, and slopes `(*batch, k, 4, nq)`."""
+    def contact_force(
+        self,
+        q: Tensor,
+        qd: Tensor,
+        tau: Tensor,
+        qdd: Tensor,
+        *,
+        active: Tensor | None = None,
+        qdd_std: Tensor | None = None,
+    ) -> Prediction:
+        """Estimate, separately for each state, the forces of all contacts in world axes [N].
+
+        The result is that of `StructuredFit.contact_force` for samples in any order. Friction with memory
+        requires a log in time order and is not tracked.
+
+        Args:
+            q, qd, tau, qdd: states with measured accelerations, `(*batch, nq)`.
+            active: mask `(*batch, n_contacts)` of closed contacts. By default, all contacts are closed.
+            qdd_std: standard deviation of the acceleration noise `(nq,)`. The default is that of the fit.
+
+        Returns:
+            The mean `(*batch, 3 c)` and covariance `(*batch, 3 c, 3 c)` of c contacts, zero for open
+            contacts. With several contacts, `parts` has the slice of each.
+
+        Raises:
+            ModelError: the system has no contact, or friction jams a contact.
+            ShapeError: an argument has the wrong shape for the system, or is not finite.
+        """
+        names = surface_contacts(self.system, None)
+        arrays, batch = self._measured((q, qd, tau, qdd), active, qdd_std, AXES * len(names))
+        pointers = [None if x is None else x.data_ptr() for x in arrays]
+        status = self.library.forcegp_contact_force(self._memory, batch.numel(), *pointers)
+        if status:
+            raise KINDS.get(status, NumericalError)(MESSAGES[status])
+        mean, covariance, beyond = arrays[-3:]
+        far = beyond if LOW in self.model.tensors else None
+        parts, joints = parts_of_contacts(names), self.system.robot.joint_names
+        return Prediction(mean, covariance, parts, far, joints, checked=True)
+
+    def _measured(
+        self, state: Sequence[Tensor], active: Tensor | None, qdd_std: Tensor | None, k: int
+    ) -> tuple[tuple[Any, ...], torch.Size]:
+        """Return the arrays for an estimate of k unknowns from accelerations, and the batch shape.
+
+        The last three arrays are the outputs: mean, covariance and distance beyond the training data.
+        """
         q, qd, tau, qdd = state
-        if self.model.wrench is None:
-            raise ModelError(
-                "this fit was compiled without an external wrench",
-                hint='fit.compiled(wrench=forcegp.WrenchFrame("tool"))',
-            )
-        nq, k = self.system.robot.nq, len(self.model.wrench.axes)
-        flat = flat_states(self.system, q, qd, tau, active)
+        nq, flat = self.system.robot.nq, flat_states(self.system, q, qd, tau, active)
         self.system.robot.check_state(qdd=qdd)
         if not bool(torch.isfinite(qdd).all()):
             raise ShapeError("qdd contains values that are not finite", expected="finite numbers")
         rows = qdd.expand(*flat.batch, nq).reshape(-1, nq)
         std = None if qdd_std is None else qdd_std.to(q).expand(nq).contiguous()
-        mean, covariance = q.new_empty(*flat.batch, k), q.new_empty(*flat.batch, k, k)
-        beyond = q.new_empty(*flat.batch, nq)
-        slopes = q.new_empty((*flat.batch, k, 4, nq) if differentiate else (0, k, 4, nq))
         inputs = [x.contiguous() for x in (flat.q, flat.qd, flat.tau, rows, flat.active)]
-        pointers = [None if x is None else x.data_ptr() for x in (*inputs, std, mean, covariance, beyond)]
-        along = slopes.data_ptr() if differentiate else None
-        count = flat.batch.numel()
-        status = self.library.forcegp_external_wrench(self._memory, count, *pointers, along)
+        outputs = (q.new_empty(*flat.batch, *shape) for shape in ((k,), (k, k), (nq,)))
+        return (*inputs, std, *outputs), flat.batch
+
+    def _wrench(
+        self, state: Sequence[Tensor], active: Tensor | None, qdd_std: Tensor | None, differentiate: bool
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Return mean, covariance, distance beyond the training data, and slopes `(*batch, k, 4, nq)`."""
+        if self.model.wrench is None:
+            raise ModelError(
+                "this fit was compiled without an external wrench",
+                hint='fit.compiled(wrench=forcegp.WrenchFrame("tool"))',
+            )
+        k, q = len(self.model.wrench.axes), state[0]
+        arrays, batch = self._measured(state, active, qdd_std, k)
+        slopes = q.new_empty((*batch, k, 4, q.shape[-1]) if differentiate else (0, k, 4, q.shape[-1]))
+        pointers = [None if x is None else x.data_ptr() for x in (*arrays, slopes if differentiate else None)]
+        status = self.library.forcegp_external_wrench(self._memory, batch.numel(), *pointers)
         if status:
             raise KINDS.get(status, NumericalError)(MESSAGES[status])
+        mean, covariance, beyond = arrays[-3:]
         return mean, covariance, beyond, slopes
 
     def linearize(

@@ -240,7 +240,12 @@ class Mean:
                 text = f"the columns of {prior.name!r} have no form in C and CasADi: {cause}"
                 expected = "arithmetic, abs, integer powers and the functions of forcegp.forces.term"
                 raise ModelError(text, expected=expected) from cause
-            return {name: list(column) for name, column in columns.items()}
+            zero = self.graph.constant(0.0)
+            acts = [driven or not prior.needs_drive for driven in self.robot.driven.tolist()]
+            return {
+                name: [x if y else zero for x, y in zip(column, acts, strict=True)]
+                for name, column in columns.items()
+            }
         if isinstance(prior, contact.SurfaceForcePrior):
             at = self.touching[self.names.index(prior.contact)]
             square = at.sliding @ at.sliding
@@ -410,7 +415,8 @@ class LearnedMotion(Mean):
             if part.size:
                 first, slope = first + part.components, slope + part.components * self.x[p].shape[1]
             if isinstance(prior, InertialPrior):
-                errors = f * np.array(prior.scale(self.robot).tolist())
+                (columns, units), errors = part.inertial(self.robot), self.zeros((PARAMETERS + 1) * n)
+                errors[columns] = f * np.array(units.tolist())
                 links, drives = errors[: PARAMETERS * n].reshape(n, PARAMETERS), errors[PARAMETERS * n :]
                 Q = Q - self._inertial_force(links, drives)
             elif isinstance(prior, DrivePrior):

@@ -15,10 +15,11 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import accumulate
+from itertools import accumulate, pairwise
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from forcegp.constraints import ConstrainedSystem, SurfaceContact
 from forcegp.errors import ModelError
@@ -45,6 +46,8 @@ from forcegp.gp.kernels import (
     sub,
 )
 from forcegp.gp.sparse import SparsePosterior
+from forcegp.identification import base_parameters
+from forcegp.robot.model import RobotModel
 
 PRIORS = (joint.JointForcePrior, ResidualPrior, InertialPrior, PayloadPrior, DrivePrior)
 PRIORS += (contact.NormalForcePrior, contact.SlidingFrictionPrior, contact.ContactForcePrior)
@@ -77,6 +80,7 @@ class Functions:
         whitening: a matrix `(m, kept)` that whitens k(x, X) for each component, or `None`.
         roots: the matrix C of each component, `(functions, rank − first)`.
         first: the first nonzero column for each component.
+        parameters: for errors of base parameters, their columns in [Y, diag q̈].
     """
 
     prior: ForcePrior
@@ -87,6 +91,7 @@ class Functions:
     whitening: tuple[Tensor, ...] | None
     roots: tuple[Tensor, ...]
     first: tuple[int, ...]
+    parameters: tuple[int, ...] = ()
 
     @property
     def components(self) -> int:
@@ -102,6 +107,14 @@ class Functions:
     def size(self) -> int:
         """Number m of support points."""
         return 0 if self.rest is None else points(self.support)
+
+    def inertial(self, robot: RobotModel) -> tuple[list[int], Tensor]:
+        """Return the columns of [Y, diag q̈] that errors of inertia multiply, and the units of the errors."""
+        if self.parameters:
+            return list(self.parameters), torch.ones(len(self.parameters), dtype=torch.float64)
+        assert isinstance(self.prior, InertialPrior)
+        units = self.prior.scale(robot)
+        return list(range(len(units))), units
 
     def columns(self, names: Sequence[str] | None) -> list[int]:
         """Return the columns of the named inputs, or of all inputs."""
@@ -124,10 +137,11 @@ class ExportedModel:
         functions: number r of functions in a reduced-rank covariance. `None` means all functions, and 0 means
             that only the mean is exported.
         sampling: for samples learned online, the variance of the torque noise `(nq,)`, the exponent κ of the
-            likelihood, and whether samples must be in motion. It is `None` if the model cannot learn online.
+            likelihood, and whether samples must be in motion. `None` if it does not learn online.
         wrench: the frame and components of an external wrench to estimate, or `None`.
         dtype: precision of the C code.
         never_closed: contacts that are never closed in the training data.
+        jacobians: whether to export Jacobians of the mean.
     """
 
     system: ConstrainedSystem
@@ -141,6 +155,12 @@ class ExportedModel:
     wrench: WrenchFrame | None = None
     dtype: torch.dtype = torch.float64
     never_closed: tuple[str, ...] = ()
+    jacobians: bool = True
+
+    @property
+    def reads_contacts(self) -> bool:
+        """Whether the code reads contact forces off accelerations, which single precision cannot resolve."""
+        return bool(self.system.contacts) and self.dtype == torch.float64
 
     @property
     def online(self) -> bool:
@@ -216,6 +236,36 @@ class ExportedModel:
             return self._of_basis(self.posterior.latent)
         return self._of_rows(self.posterior.latent)
 
+    def parts_of_motion(self) -> list[Functions]:
+        """Functions of each prior, with errors of base parameters instead of all inertial parameters.
+
+        The posterior of the forces is the same. If the sign of T Tᵀ is negative, D is diagonal only for
+        errors of all parameters, and these are returned, as for a model that learns online, with priors on
+        independent errors.
+        """
+        parts = self.parts()
+        p = next((p for p, part in enumerate(parts) if isinstance(part.prior, InertialPrior)), None)
+        if p is None or self.sign < 0 or self.online:
+            return parts
+        part, (B, parameters) = parts[p], _acting_errors(parts[p], self.system.robot)
+        C = [pad(C, (x, 0)) for part in parts for C, x in zip(part.roots, part.first, strict=True)]
+        at = sum(len(part.roots) for part in parts[:p])
+        C[at : at + B.shape[1]] = errors = (B @ torch.cat(C[at : at + B.shape[1]])).split(1)
+        one = KernelPart(Constant(), {"log_scale": B.new_zeros(len(B))})
+        changes = {"weights": B @ part.weights, "finite": one, "roots": errors, "parameters": parameters}
+        parts[p] = dataclasses.replace(part, **changes)
+        # C Cᵀ = R Rᵀ with an upper triangular R, whose rows keep their columns.
+        surplus = [part.first[0] + k for k in range(B.shape[1]) if k not in parameters]
+        order = surplus + [i for i in range(part.rank) if i not in surplus]
+        R = torch.linalg.qr(torch.cat(C)[:, order].flip(0, 1).mT, mode="r").R.mT.flip(0, 1)
+        first = 0
+        for i, part in enumerate(parts):
+            starts = list(accumulate(map(len, part.roots), initial=first))
+            roots = tuple(R[a:b, a:] for a, b in pairwise(starts))
+            parts[i] = dataclasses.replace(part, roots=roots, first=tuple(starts[:-1]))
+            first = starts[-1]
+        return parts
+
     def _of_basis(self, latent: SparsePosterior) -> list[Functions]:
         basis, parts = latent.basis, []
         if self.functions is None:
@@ -270,6 +320,20 @@ class ExportedModel:
             C, first = tuple(whole[..., 1:]), (0,) * len(whole)
             parts.append(Functions(prior, cut.rest, cut.finite, support, whole[..., 0], None, C, first))
         return parts
+
+
+def _acting_errors(part: Functions, robot: RobotModel) -> tuple[Tensor, tuple[int, ...]]:
+    """Return B, which maps the weights of errors of inertia to errors of base parameters and drives.
+
+    The second value contains the columns of these parameters in [Y, diag q̈].
+    """
+    base, units = base_parameters(robot), part.inertial(robot)[1]
+    assert part.finite is not None and isinstance(part.finite.kernel, Constant)
+    links = base.combination.shape[1]
+    drives = links + units[links:].nonzero()[:, 0]
+    of_links = pad(torch.from_numpy(base.combination), (0, len(units) - links))
+    B = torch.cat([of_links, torch.eye(len(units), dtype=of_links.dtype)[drives]])
+    return B * units * part.finite.kernel.std(part.finite.params), (*base.columns, *drives.tolist())
 
 
 def row_of(x: Tensor, k: int) -> Tensor:

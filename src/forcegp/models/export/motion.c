@@ -121,7 +121,7 @@ static int motion(const double *folded, const waves *w, long sample, const doubl
   double forward[NQ], backward[NQ], faster[NQ], free[NQ];
   int status, size, overshoots = 0;
   if ((status = prepare(q, qd, tau, closed, &e, gain)) != 0) return status;
-  f.learned = NULL, f.functions = NULL, f.folded = folded ? folded + sample * FOLDED[COMPONENTS] : NULL;
+  f.learned = NULL, f.folded = folded ? folded + sample * FOLDED[COMPONENTS] : NULL;
   if ((status = latent_forces(q, qd, tau, &e, gain, 0, &f)) != 0) return status;
   add_waves(w, &e, sample, 0, &f);
   inertial_errors(q, qd, tau, &e, NULL, &f);

@@ -28,9 +28,14 @@ void forcegp_begin(forcegp_learned *s) {
   memset(s, 0, sizeof *s);
   memcpy(s->weights, WEIGHTS, sizeof s->weights);
   for (int k = 0; k < COMPONENTS; ++k)
-    for (int i = FUNCTION[k], own = 0; i < FUNCTION[k + 1]; ++i)
-      for (int j = FUNCTION[k]; j < RANK; ++j, ++own)
-        if (i <= j) s->root[(long)j * (j + 1) / 2 + i] = ROOTS[k][own];
+    for (int i = FUNCTION[k]; i < FUNCTION[k + 1]; ++i) {
+      const double *row = INDEPENDENT[k] ? NULL : ROOTS[k] + (long)(i - FUNCTION[k]) * (WIDTH - START(k));
+      if (INDEPENDENT[k]) s->root[(long)i * (i + 1) / 2 + i] = 1.0;
+      for (int c = START(k); !INDEPENDENT[k] && c < COLUMNS; ++c) {
+        const long j = COLUMN[c];
+        if (j >= i) s->root[j * (j + 1) / 2 + i] = row[c - START(k)];
+      }
+    }
   fold(s);
 }
 
@@ -78,7 +83,7 @@ int forcegp_update(forcegp_learned *s, const double *q, const double *qd, const 
   equations e;
   latent f;
   affine z;
-  double expected[NQ], gain[NQ * SOME(ROWS)], W[SIZE_OF_ALL][COMPONENTS], V[RANK], Phi[GROUP][RANK] = {{0.0}};
+  double expected[NQ], gain[NQ * SOME(ROWS)], W[COMPONENTS * SIZE_OF_ALL], Phi[GROUP][RANK] = {{0.0}};
   double y[GROUP] = {0.0}, std[GROUP], X_inv[GROUP][GROUP] = {{0.0}}, p[GROUP] = {0.0}, g[GROUP], fastest = 0.0;
   int size, status, bit = 0;
   while (bit < QUANTITIES && quantity != 1u << bit) ++bit;
@@ -90,7 +95,7 @@ int forcegp_update(forcegp_learned *s, const double *q, const double *qd, const 
   }
   if ((status = prepare(q, qd, tau, closed, &e, gain)) != 0) return status;
   if (fastest <= REST_SPEED) return FORCEGP_AT_REST;
-  f.learned = s, f.folded = s->folded, f.functions = V;
+  f.learned = s, f.folded = s->folded;
   if ((status = latent_forces(q, qd, tau, &e, gain, 1, &f)) != 0) return status;
   inertial_errors(q, qd, tau, &e, quantity == FORCEGP_QDD ? measured : NULL, &f);
   /* rows (W V^T, y - E[y]) / sigma with W = B E, of noise (1 + N N^T) / kappa with N = B_Q Sigma_tau^1/2 / sigma */
@@ -102,7 +107,7 @@ int forcegp_update(forcegp_learned *s, const double *q, const double *qd, const 
   for (int a = 0; a < size; ++a) {
     y[a] = (measured[a] - y[a]) / std[a];
     for (int k = 0; k < COMPONENTS; ++k)
-      for (int i = FUNCTION[k]; i < FUNCTION[k + 1]; ++i) Phi[a][i] = W[a][k] / std[a] * V[i];
+      for (int i = FUNCTION[k]; i < FUNCTION[k + 1]; ++i) Phi[a][i] = W[k * size + a] / std[a] * f.V[i];
   }
   for (int k = 0; k < GROUP; ++k) X_inv[k][k] = TEMPERING;
   for (int r = 0; quantity == FORCEGP_QDD && r < ROWS; ++r) { /* A qdd = b fixes these directions */

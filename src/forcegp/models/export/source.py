@@ -5,9 +5,8 @@
 
 from __future__ import annotations
 
-import math
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from importlib.resources import files
 from itertools import accumulate
 from typing import NamedTuple
@@ -29,7 +28,7 @@ from forcegp.forces.priors.inertial import PER_PAYLOAD, InertialPrior, PayloadPr
 from forcegp.forces.priors.joint import TERMS
 from forcegp.forces.quantities import PREDICTED, ROUNDED
 from forcegp.forces.term import JointTerm, PerJointPrior
-from forcegp.forces.unknowns import tip_keys
+from forcegp.forces.unknowns import tip_keys, unknown_tip
 from forcegp.gp import kernels
 from forcegp.gp.basis import KernelPart
 from forcegp.gp.draws import MISSED_FEATURES
@@ -38,6 +37,7 @@ from forcegp.gp.sparse import SparsePosterior
 from forcegp.learning.specification import REST_SPEED
 from forcegp.models.export.mean import ARGUMENTS, DIFFERENTIATED, LearnedMotion
 from forcegp.models.export.model import ExportedModel, Functions, row_of
+from forcegp.models.external_wrench import LEAST_VARIANCE
 from forcegp.models.prediction import NEGATIVE, ROUNDING
 from forcegp.rollout import law
 
@@ -49,6 +49,8 @@ READ = tuple(PREDICTED)
 """Quantities of the C code, in the order of their bits."""
 STEPS = 2e-5, 1e-3
 """Steps of fourth-order differences in q and q̇, and in τ and q̈. Friction changes within 0.01 rad/s."""
+LANES = 16
+"""Numbers that a loop of the C code computes at a time: two of the widest vector registers."""
 TARGETS = (JOINT, CONTACT, CONSTRAINT)
 GIVEN = """const double *restrict q, const double *restrict qd, const double *restrict tau,
     const equations *restrict e, const double *restrict gain, int spread, latent *restrict f"""
@@ -56,7 +58,7 @@ SLOPES = "const equations *restrict e, double *restrict f, double *restrict slop
 
 
 def c_source(model: ExportedModel, name: str, rollout: bool = False) -> tuple[str, str]:
-    """Return the header and the source text, with Jacobians or, for a rollout, the motion of trajectories.
+    """Return the header and the source text, for predictions or, for a rollout, the motion of trajectories.
 
     Raises:
         ModelError: a part of the model has no C form. The message names it.
@@ -70,10 +72,11 @@ def c_source(model: ExportedModel, name: str, rollout: bool = False) -> tuple[st
     used = (text for text in each if any(f" {_called(text)}(" in x for x in priors))
     head = GUIDE + '#include <math.h>\n#include <string.h>\n#include "forcegp.h"\n'
     head += "#ifdef __cplusplus\n#define restrict __restrict__\n#endif\n"
-    blocks = [head, "\n".join(writer.lines), *_programs(writer.mean, rollout), before, *used, *priors, after]
-    blocks += [template("motion.c", writer.sticking()) if rollout else template("jacobian.c")]
+    blocks = [head, "\n".join(writer.lines), *_programs(writer, rollout), before, *used, *priors, after]
+    blocks += [template("motion.c", writer.sticking())] if rollout else []
+    blocks += [template("jacobian.c")] if writer.differentiates else []
     blocks += [template("online.c")] if model.online else []
-    blocks += [template("wrench.c")] if model.wrench and not rollout else []
+    blocks += [template("measured.c")] if writer.measures else []
     robot, contacts = model.system.robot, model.system.contact_names
     fields = {
         "nq": robot.nq,
@@ -83,6 +86,8 @@ def c_source(model: ExportedModel, name: str, rollout: bool = False) -> tuple[st
         "bits": "\n".join(f"#define FORCEGP_{x.upper()} {1 << i}u" for i, x in enumerate(READ)),
         "online": writer.online_header(),
         "wrench": writer.wrench_header(),
+        "contact_force": template("contact_force.h") if model.reads_contacts else "",
+        "jacobian": template("jacobian.h") if model.jacobians else "",
     }
     precise = in_single_precision if model.dtype == torch.float32 else str
     return tuple(  # pyright: ignore[reportReturnType]
@@ -139,9 +144,9 @@ def _called(text: str) -> str:
     return text.partition("static ")[2].partition("(")[0].split()[-1]
 
 
-def _programs(mean: LearnedMotion, rollout: bool) -> list[str]:
+def _programs(writer: Writer, rollout: bool) -> list[str]:
     """Return the code for mechanics with contacts, forward dynamics, Y, and Jacobians or sliding friction."""
-    robot = mean.robot
+    mean, robot = writer.mean, writer.mean.robot
     blocks = [mean.M, mean.Q_C, mean.Q_G, mean.Q_D, *(x for at in mean.touching for x in at), *mean.x]
     outputs = [x for block in blocks for x in block.flat]
     outputs += [*(x for features in mean.phi for phi in features for x in phi), *mean.expected]
@@ -153,25 +158,55 @@ def _programs(mean: LearnedMotion, rollout: bool) -> list[str]:
         programs["wrench_jacobian"] = mean.wrench_jacobian(mean.model.wrench)
     if rollout:
         programs["sliding"] = mean.program(mean.sliding()[1], (*ARGUMENTS[:3], "slip"))
-    else:
+    if writer.differentiates:
         quantities = mean.quantities()
         values = np.concatenate([quantities[x] for x in DIFFERENTIATED])
         programs["slopes_of_mean"] = mean.program(mean.tangents(values).flat, (*ARGUMENTS, "f", "slope"))
     return [f"#define MECHANICS {len(outputs)}", *(c_function(*item) for item in programs.items())]
 
 
+def _padded(count: int) -> int:
+    """Return the next multiple of `LANES`."""
+    return -(-count // LANES) * LANES
+
+
+def _touched(parts: Sequence[Functions], sign: int) -> tuple[list[bool], list[bool]]:
+    """Return whether data affect the functions of each component, and the columns of C that they fill.
+
+    The other components have C = 1, with zeros in the rows of other functions. The first one is always kept.
+    """
+    columns = [True] * parts[0].rank
+    pairs = [(C, first) for part in parts for C, first in zip(part.roots, part.first, strict=True)]
+    if sign < 0:
+        return [True] * len(pairs), columns
+    C = torch.cat([torch.nn.functional.pad(C, (first, 0)) for C, first in pairs])
+    alone = (torch.eye(len(C), dtype=C.dtype) != C).logical_not()
+    alone = alone.all(0) & alone.all(1)
+    touched = [i == 0 or not bool(alone[a : a + len(C)].all()) for i, (C, a) in enumerate(pairs)]
+    for (C, a), used in zip(pairs, touched, strict=True):
+        columns[a : a + len(C)] = [used] * len(C)
+    return touched, columns
+
+
 class Writer:
     """Writer of the code for the priors. `lines` contains the tables that this code reads."""
 
     def __init__(self, model: ExportedModel, rollout: bool) -> None:
-        self.model, self.parts, self.lines, self.rollout = model, model.parts(), list[str](), rollout
+        self.model, self.lines, self.rollout = model, list[str](), rollout
+        # Samples of functions are drawn for all inertial parameters.
+        self.parts = model.parts() if rollout else model.parts_of_motion()
+        self.differentiates = model.jacobians and not rollout
+        self.measures = not rollout and (model.wrench is not None or model.reads_contacts)
         self.mean, self._tables = LearnedMotion(model, self.parts, differentiate=True), dict[str, str]()
         self.starts = list(accumulate((part.components for part in self.parts), initial=0))
         self.tables: list[list[str]] = []
+        # Components whose functions the data do not affect are independent of all others.
+        self.touched, self.kept = _touched(self.parts, model.sign)
+        self.width = _padded(sum(self.kept))
         self._constants()
         self._noise()
         self._online()
-        self._wrench()
+        self._measured()
 
     def array(self, values: Tensor | Iterable[float], name: str = "", kind: str = "double") -> str:
         """Add a constant array unless it already exists, and return its name."""
@@ -200,9 +235,16 @@ class Writer:
             "SOME(n)": "((n) > 0 ? (n) : 1)",
             "COMPONENTS": self.starts[-1],
             "RANK": self.parts[0].rank,
+            "WIDTH": self.width,
+            "COLUMNS": sum(self.kept),
+            "PADDED": _padded(self.parts[0].rank),
+            "LANES": LANES,
+            "START(k)": "(POSITION[k] / LANES * LANES)",
+            "FUNCTIONS": sum(len(C) for part in self.parts for C in part.roots),
             "MOST_FUNCTIONS": max(part.weights.shape[1] for part in self.parts),
             "SIGN": f"({self.model.sign}.0)",
             "QUANTITIES": len(READ),
+            "MOST_UNKNOWNS": max(robot.nq, 3 * len(contacts), 6 + len(contacts)),
             "SIZE_OF_ALL": sum(sizes),
             "COULOMB": len(process.coulomb),
             "INPUTS": sum(x.size for x in self.mean.x),
@@ -229,6 +271,10 @@ class Writer:
         if contacts:
             self.array([c.name in self.model.never_closed for c in contacts], "NEVER_CLOSED", "int")
         self.array(accumulate((len(w) for x in self.parts for w in x.weights), initial=0), "FOLDED", "int")
+        rows = [len(C) for part in self.parts for C in part.roots]
+        self.array(accumulate(rows, initial=0), "FUNCTION", "int")
+        self.array([not kept for kept in self.touched], "INDEPENDENT", "int")
+        self.array([sum(self.kept[:i]) for part in self.parts for i in part.first], "POSITION", "int")
         owners = [part.prior for part in self.parts for _ in range(part.components)]
         self.array([TARGETS.index(prior.target) for prior in owners], "TARGET", "int")
         self.array([float(isinstance(prior, JointTerm)) for prior in owners], "IS_FRICTION", "int")
@@ -242,11 +288,14 @@ class Writer:
                 self.lines.append(f"#define DRIVES_MEASURED {int(part.prior.is_error)}")
             if isinstance(part.prior, InertialPrior):
                 self.lines.append(f"#define INERTIAL {start}")
-                self.lines.append(f"#define INERTIAL_COLUMNS {part.components}")
-                self.array(part.prior.scale(robot), "INERTIAL_SCALE")
+                self.lines.append(f"#define INERTIAL_COUNT {part.components}")
+                columns, units = part.inertial(robot)
+                self.array(columns, "INERTIAL_COLUMN", "int")
+                self.array(units, "INERTIAL_UNITS")
             if isinstance(part.prior, PayloadPrior):
-                column = PER_PAYLOAD * part.prior.link(robot)
-                self.lines += [f"#define PAYLOAD {start}", f"#define PAYLOAD_COLUMN {column}"]
+                self.lines.append(f"#define PAYLOAD {start}")
+                first = PER_PAYLOAD * part.prior.link(robot)
+                self.array(range(first, first + part.components), "PAYLOAD_COLUMN", "int")
                 self.lines.append(f"#define PAYLOAD_MEASURED {int(part.prior.measured)}")
                 self.array(part.prior.units(robot.mass), "PAYLOAD_UNITS")
         if process.coulomb:
@@ -265,11 +314,10 @@ class Writer:
         sticks = STICK_NOISE in values
         self.array((2.0 * values[STICK_NOISE]).exp() if sticks else zero, "STICK_VARIANCE")
         self.array(values[STICK_SPEED].exp() if sticks else zero + 1.0, "STICK_SPEED")
-        tips = [tip_keys(name) for name in self.model.system.contact_names]
-        for name, field in (("SLIDE", "slides"), ("REST", "rests")):
-            log = [float(values.get(getattr(tip, field), -math.inf)) for tip in tips]
-            self.array([math.exp(2.0 * x) for x in log] or [0.0], f"{name}_VARIANCE")
-        self.array([math.exp(float(values.get(tip.speed, 0.0))) for tip in tips] or [1.0], "TIP_SPEED")
+        names = self.model.system.contact_names
+        tips = [unknown_tip(values, name) for name in names] or [(0.0, 0.0, 1.0)]
+        self.array(torch.tensor(tips, dtype=torch.float64), "TIP")
+        self.array([tip_keys(name).rests in values for name in names] or [0], "TIP_LEARNED", "int")
         for name, std in (("TORQUE", self.model.torque_std), ("EXTERNAL", self.model.external_std)):
             variance = zero if std is None else std.expand(nq) ** 2
             if name == "EXTERNAL" and MEMORY in values:  # a program follows no bristles
@@ -287,9 +335,9 @@ class Writer:
         parts, latent = self.parts, self.model.posterior.latent
         assert isinstance(latent, SparsePosterior)
         self.array(latent.joint_weights, "WEIGHTS")
-        self.array(accumulate((len(C) for part in parts for C in part.roots), initial=0), "FUNCTION", "int")
         self.array([part.size for part in parts for _ in range(part.components)], "POINTS", "int")
         self.array(self.starts, "FIRST_COMPONENT", "int")
+        self.array([i for i, kept in enumerate(self.kept) if kept], "COLUMN", "int")
         self.array(variance, "LEARNED_TORQUE_VARIANCE")
         group = "CONTACTS * 3 > NQ ? CONTACTS * 3 : NQ"
         self.lines.append(
@@ -298,16 +346,25 @@ class Writer:
         self.lines.append(f"static const double REST_SPEED = {REST_SPEED if moving else -1.0!r};")
         self.lines.append(f"static const double TEMPERING = {power**0.5!r};")
 
-    def _wrench(self) -> None:
-        """Add the priors of an external wrench and of the multipliers that are estimated with it."""
-        frame, rows = self.model.wrench, len(self.model.system.contacts)
-        if frame is None or self.rollout:
+    def _measured(self) -> None:
+        """Add the priors of unknown forces that are estimated from accelerations."""
+        frame, names = self.model.wrench, self.model.system.contact_names
+        if not self.measures:
             return
-        self.array([*frame.prior.tolist(), *rows * [MULTIPLIER_STD]], "WRENCH_PRIOR")
-        self.array(torch.stack(frame.levers), "LEVERS")
-        most = max(len(frame.axes) + rows, self.model.system.robot.nq)
-        self.lines.append(f"enum {{ LEVER_COUNT = {len(frame.levers)}, MOST_UNKNOWNS = {most} }};")
-        self.lines.append("static const double STATE_STEP = {!r}, FORCE_STEP = {!r};".format(*STEPS))
+        k = 0 if frame is None else len(frame.axes)
+        unknowns = max(k + len(names) if k else 0, 3 * len(names))
+        self.lines.append(f"enum {{ UNKNOWNS = {unknowns} }};")
+        if frame is not None:
+            self.array([*frame.prior.tolist(), *len(names) * [MULTIPLIER_STD]], "WRENCH_PRIOR")
+            self.array(torch.stack(frame.levers), "LEVERS")
+            self.lines.append(f"enum {{ LEVER_COUNT = {len(frame.levers)} }};")
+            self.lines.append("static const double STATE_STEP = {!r}, FORCE_STEP = {!r};".format(*STEPS))
+        if names:
+            owners = [part.prior for part in self.parts for _ in range(part.components)]
+            owners = [getattr(prior, "contact", None) for prior in owners]
+            self.array([-1 if name is None else names.index(name) for name in owners], "OWNER", "int")
+            self.lines.append(f"static const double NORMAL_STD = {MULTIPLIER_STD!r};")
+            self.lines.append(f"static const double LEAST_VARIANCE = {LEAST_VARIANCE!r};")
 
     def wrench_header(self) -> str:
         """Return the part of the header for an external wrench, if there is one."""
@@ -336,12 +393,12 @@ class Writer:
             unread = "  (void)q, (void)qd, (void)tau, (void)e, (void)gain, (void)spread;\n"
             texts.append(title + unread + "\n".join(body) + "\n  return 0;\n}\n")
             calls.append(f"  if (prior_{p}(q, qd, tau, e, gain, spread, f) != 0) return FORCEGP_JAMMED;\n")
-        for i, name in ((1, "WHITENINGS"), (3, "ROOTS")) if self.model.online else ():
+        for i, name in ((3, "ROOTS"), (1, "WHITENINGS"))[: 1 + self.model.online]:
             column = ", ".join(tables[i] for tables in self.tables)
             self.lines.append(f"static const double *const {name}[] = {{{column}}};")
         texts.append(f"static int latent_forces({GIVEN}) {{\n{''.join(calls)}  return 0;\n}}\n")
         if not self.rollout:
-            return [*texts, *self._slopes()]
+            return [*texts, *self._slopes()] if self.differentiates else texts
         chosen = "".join(calls[p] for p in self.mean.sliding()[0])
         unread = "  (void)q, (void)qd, (void)tau, (void)e, (void)gain, (void)spread, (void)f;\n"
         return [*texts, f"static int sticking_forces({GIVEN}) {{\n{unread}{chosen}  return 0;\n}}\n"]
@@ -388,7 +445,7 @@ class Writer:
         if isinstance(prior, contact.CoulombErrorPrior):
             law = next(x for x in prior.friction if x.contact == prior.contact)
             numbers = f"{float(law.coefficient)!r}, {float(law.smoothing)!r}"
-            return [f"  friction_error(e, tau, gain, {c}, {numbers}, {E});"]
+            return [f"  friction_error(e, {c}, {numbers}, {E});"]
         if not isinstance(prior, contact.SlidingFrictionPrior):
             return [f"  tangential(e, {c}, {E});"]
         terms = self.array([contact.TERMS.index(term) for term in prior.terms], kind="int")
@@ -411,10 +468,16 @@ class Writer:
             white, kept = "0", 0
             if part.whitening is not None and m:
                 white, kept = self.array(part.whitening[k].flatten()), part.whitening[k].shape[1]
-            tables = [self.array(part.weights[k]), white, str(kept), self.array(part.roots[k].flatten())]
+            # Rows of C begin and end at multiples of `LANES`.
+            root = torch.zeros(1)
+            if self.touched[self.starts[p] + k]:
+                filled, begin = torch.tensor(self.kept), part.first[k]
+                padding = sum(self.kept[:begin]) % LANES, self.width - sum(self.kept)
+                root = torch.nn.functional.pad(part.roots[k][:, filled[begin:]], padding)
+            tables = [self.array(part.weights[k]), white, str(kept), self.array(root.flatten())]
             self.tables.append(tables)
-            rest = f"{part.first[k]}, spread, {self.starts[p] + k}, f"
-            lines.append(f"    component(V, {m}, {len(phi)}, {variance}, {', '.join(tables)}, {rest});\n  }}")
+            rest = f"{', '.join(tables[:3])}, spread, {self.starts[p] + k}, f"
+            lines.append(f"    component(V, {m}, {len(phi)}, {variance}, {rest});\n  }}")
         return lines
 
     def _slopes(self) -> list[str]:

@@ -33,11 +33,16 @@ static void compare(int n, const @real@ *m, const @real@ *C, const double *mean,
 
 int main(void) {
   double in_slopes = 0.0;
-  @real@ m[D], C[D * D], beyond[@NAME@_JOINTS], J[SLOPES];
+  static @real@ J[SLOPES];
+  @real@ m[D], C[D * D], beyond[@NAME@_JOINTS];
   if (@name@_size(WANTED) != D) return 2;
   for (int i = 0; i < STATES; ++i) {
     double most = 0.0;
+#ifdef JACOBIANS
     const int second = @name@_jacobian(q[i], qd[i], tau[i], closed[i], @NAME@_QDD | @NAME@_MULTIPLIER, m, J);
+#else
+    const int second = @NAME@_NO_JACOBIAN;
+#endif
     int status = @name@_predict(q[i], qd[i], tau[i], closed[i], WANTED, 0, m, C, beyond);
     if (status == @NAME@_UNDETERMINED) status = 0;
     if (status == 0) compare(D, m, C, mean[i], covariance[i]);
@@ -45,6 +50,11 @@ int main(void) {
     if (status == 0)
       status = @name@_external_wrench(NULL, 1, q[i], qd[i], tau[i], qdd[i], closed[i], NULL, m, C, beyond, NULL);
     if (status == 0 && !REDUCED) compare(@NAME@_WRENCH, m, C, wrench[i], wrench_covariance[i]);
+#endif
+#ifdef CONTACT_FORCE
+    if (status == 0)
+      status = @name@_contact_force(NULL, 1, q[i], qd[i], tau[i], qdd[i], closed[i], NULL, m, C, beyond);
+    if (status == 0 && !REDUCED) compare(3 * @NAME@_CONTACTS, m, C, contact_force[i], contact_force_covariance[i]);
 #endif
     if (status != 0 || (second != 0 && second != @NAME@_NO_JACOBIAN)) {
       printf("state %d: errors %d, %d\n", i, status, second);
