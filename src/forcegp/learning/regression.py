@@ -283,7 +283,7 @@ def memory_noise(scales: Scales) -> Tensors:
     process = problem.process_at(scales.values)
     for p, prior in enumerate(problem.priors):
         past = [m for m in problem.training.measurements if m.history is not None]
-        if prior.remembers and past:
+        if isinstance(prior, JointTerm) and prior.remembers and past:
             x = [process.features(p, problem.system, m.at(problem.system)) for m in past]
             phi = torch.cat([basis.parts[p].values(each)[0] for each in x], dim=1)
             square = phi.mT @ phi / phi.shape[1]
