@@ -28,6 +28,7 @@ from forcegp.forces.problem import force_posterior, kernel_parameters
 from forcegp.forces.quantities import States, affine_map, states
 from forcegp.forces.term import ExpectedForce
 from forcegp.gp.kernels import Linear
+from forcegp.learning.specification import problem_for
 from forces.cases import CONTACTS, draw, logged, mixed_contacts, sampled_forces, two_contacts
 from random_data import table_system
 
@@ -272,3 +273,18 @@ def test_the_multiplier_is_as_uncertain_as_learned_friction_leaves_it() -> None:
     alone = force_posterior(fit.problem, fit.hyperparameters).read(fit.system, at, z)[1][:, 0, 0]
     torch.testing.assert_close(found[:, 0].sqrt(), expected.sqrt(), rtol=INTEGRATED, atol=0.0)
     assert bool((alone.sqrt() < 0.8 * expected.sqrt()).any()), "the friction hardly matters here"
+
+
+def test_the_search_for_friction_sees_contacts_that_slide() -> None:
+    """Of 400 samples, 20 slide, and 10 of them are among 50 that are evenly spaced."""
+    system, data = two_contacts(), logged(two_contacts(), 400)
+    slides = torch.arange(400) % 20 == 4
+    data = dataclasses.replace(data, qd=torch.where(slides[:, None], data.qd, 1e-4 * data.qd))
+    prior = SlidingFrictionPrior(CONTACTS[0], coupled=True)
+    model = forcegp.StructuredGP(system, force_priors=[JointFrictionPrior(), prior], noise=0.1)
+    problem = problem_for(model.specification, None, data, None)[1]
+    (few,) = problem.showing_coulomb(50).training.measurements
+    moving = few.qd.norm(dim=-1) > 1e-2
+    assert int(moving.sum()) == 20 and len(few.q) <= 51
+    assert all(bool((few.q == x).all(-1).any()) for x in data.q[slides])
+    assert problem.showing_coulomb(1000).training.samples == problem.training.samples

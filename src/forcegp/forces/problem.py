@@ -7,6 +7,7 @@ by piece, accumulating sums over the samples that determine the posterior.
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -19,7 +20,7 @@ from forcegp.constraints import ConstrainedSystem
 from forcegp.errors import ModelError
 from forcegp.forces.measurements import Measurement, Training, scaled
 from forcegp.forces.noise import TORQUE_NOISE, ForceNoise, SampleNoise, state_jacobian
-from forcegp.forces.posterior import ForcePosterior, ForceProcess, hidden_variance, trained_region
+from forcegp.forces.posterior import STICKING, ForcePosterior, ForceProcess, hidden_variance, trained_region
 from forcegp.forces.priors.base import ANALYTICAL, NOISE, RESERVED, ForceMean, ForcePrior
 from forcegp.forces.priors.contact import CoulombErrorPrior, CoulombFriction, coulomb_of
 from forcegp.forces.projection import WhitenedRows, combine, whiten
@@ -38,6 +39,11 @@ OWN = tuple(name + "." for name in RESERVED)
 """Prefixes of learned parameters other than the hyperparameters of the priors."""
 REGION_STATES = 10_000
 """Maximum number of training states used to compute the trained region."""
+
+
+def _even(index: Tensor, count: int) -> Tensor:
+    """Return at most `count` evenly spaced entries."""
+    return index[:: max(1, math.ceil(len(index) / count))]
 
 
 def kernel_parameters(tensors: Mapping[str, Tensor]) -> Tensors:
@@ -145,6 +151,23 @@ class Problem:
     def has_coulomb(self) -> bool:
         """Whether any prior is coupled to Coulomb friction, which is proportional to the multiplier."""
         return any(prior.coupled for prior in self.priors)
+
+    def showing_coulomb(self, samples: int) -> Problem:
+        """Return the problem with at most about `samples` samples, half of them with a sliding contact.
+
+        Only those show Coulomb friction, and in the log of a walking robot they are few. Both halves are
+        evenly spaced. If half of the samples is more than all that slide, more of the others are taken.
+        """
+        system, rows = self.system, []
+        contacts = [(law.contact, system.contact_names.index(law.contact)) for law in self.coulomb({})]
+        for m in self.training.measurements:
+            points = m.at(system).eom.contact_points
+            most = math.ceil(samples * len(m.q) / self.training.samples)
+            slides = [m.active[:, k] & (points[x].sliding[1].norm(dim=-1) > STICKING) for x, k in contacts]
+            moving = _even(torch.stack(slides).any(0).nonzero()[:, 0], max(1, most // 2))
+            others = _even(torch.arange(len(m.q), device=m.q.device), max(1, most - len(moving)))
+            rows.append(torch.cat([moving, others]).unique())
+        return dataclasses.replace(self, training=self.training.of_rows(rows))
 
     def with_coulomb_errors(self, tensors: Mapping[str, Tensor]) -> tuple[Problem, Tensors]:
         """Add the error of learned Coulomb friction as a force to the problem and the tensors.

@@ -264,7 +264,7 @@ def _are_smaller(changes: Tensor) -> list[bool]:
 
 def _coulomb(problem: Problem, values: Mapping[str, Tensor], keys: list[str]) -> Tensors:
     """Return the Coulomb friction of contacts that is most probable for given scales and noise."""
-    few = dataclasses.replace(problem, training=problem.training.evenly(FRICTION_SAMPLES))
+    few = problem.showing_coulomb(FRICTION_SAMPLES)
     few = dataclasses.replace(
         few, power=min(1.0, problem.power * problem.training.samples / few.training.samples)
     )

@@ -63,7 +63,7 @@ WIDTH = {
 START_SAMPLES = 5000
 """Maximum number of evenly spaced samples used to compute initial values."""
 FRICTION_SAMPLES = 200
-"""Maximum number of evenly spaced samples used to select the initial Coulomb friction."""
+"""Maximum number of samples used to select the initial Coulomb friction."""
 COEFFICIENTS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.4, 0.8, 1.6)
 """Friction coefficients to try."""
 UNSHOWN = 0.1
@@ -111,7 +111,7 @@ def _with_friction(problem: Problem, noise: Tensors, unseen: Tensor | None) -> T
 
     From a poor coefficient, learning may reach a local optimum in which friction depends on the state.
     """
-    few = dataclasses.replace(problem, training=problem.training.evenly(FRICTION_SAMPLES), inducing=None)
+    few = dataclasses.replace(problem.showing_coulomb(FRICTION_SAMPLES), inducing=None)
     # A force that no law names is learned from what the laws leave.
     laws = few.without_priors([prior.name for prior in problem.priors if prior.remainder])
     laws = without_inducing(laws) if is_finite(laws.priors) else laws
