@@ -608,8 +608,18 @@ def case(name: str, friction: str, seed: int) -> dict[str, Any]:
     assert wrench.std is not None
     covered = ((wrench.mean - true).abs() <= 2.0 * wrench.std)[acts].double().mean()
     result["push"] = {"equations_N": float(before), "rmse_N": float(after), "coverage": float(covered)}
-    trunk = {each.name: each for each in fit.parameters() if each.name == "inertial.m of base_roll"}
-    for each in trunk.values():
+    state, active = (test.q, test.qd, test.tau, "qdd"), test.active(system.contact_names)
+    forward, file = (
+        fit.predict(*state, active=active),
+        forcegp.AnalyticalModel(system).nominal().predict(*state, active=active),
+    )
+    e, before = forward.mean - test.qdd, file.mean - test.qdd
+    ratio = (e.square().mean(0) / before.square().mean(0)).log().mean().mul(0.5).exp()
+    covered = (e.abs() <= 2.0 * (forward.std.square() + fit.noise["qdd"].square()).sqrt()).double().mean()
+    result["predicted_qdd"] = {"over_file": float(ratio), "coverage": float(covered)}
+    for each in fit.robot_parameters():
+        if (each.name, each.of) != ("link mass", "base_roll"):
+            continue
         rigid = legged.true.body_weldid == legged.base
         true = float((legged.true.body_mass - legged.nominal.body_mass)[rigid].sum())
         result["trunk"] = {"true_kg": true, "found_kg": each.value, "std_kg": each.std}

@@ -105,6 +105,27 @@ def test_the_base_has_exact_torques_and_the_trunk_is_weighed() -> None:
     found = {each.name: each for each in fit.parameters()}
     assert not any("base" in name for name in found if not name.startswith("inertial."))
     assert not any(name.startswith("inertial.drive of base") for name in found)
-    mass = found["inertial.m of base_roll"]
-    assert mass.determined and abs(mass.value - added) < 2.0 * mass.std
+    robot = {(each.name, each.of): each for each in fit.robot_parameters()}
+    mass = robot["link mass", "base_roll"]
+    assert mass.determined and mass.std is not None and abs(mass.value - added) < 2.0 * mass.std
     assert not any("too few to check the masses" in text for text in fit.result.warnings)
+    # The robot of the fit includes what was learned.
+    assert abs(float(fit.system.robot.mass[5] - solo().robot.mass[5]) - mass.value) < 1e-9
+    drives, true = fit.system.robot.armature[6:], torch.from_numpy(solo().true.dof_armature[6:])
+    assert float((drives / true).log().abs().median()) < 0.25
+
+
+@pytest.mark.slow
+def test_accelerations_of_a_walking_robot_follow_from_torques() -> None:
+    """Drives of a leg exceed its links, so that a force −d q̈ with q̈ of the file would diverge."""
+    system, _, test, _ = walking()
+    state, active = (test.q, test.qd, test.tau, "qdd"), test.active(system.contact_names)
+    predicted, file = (
+        fitted().predict(*state, active=active),
+        forcegp.AnalyticalModel(system).nominal().predict(*state, active=active),
+    )
+    assert predicted.std is not None
+    sizes = [(each.mean - test.qdd).square().mean(0).sqrt() for each in (predicted, file)]
+    assert float((sizes[0] / sizes[1]).log().mean().exp()) < 0.8
+    inside = (predicted.mean - test.qdd).abs() <= 2.0 * predicted.std
+    assert float(inside.double().mean()) > 0.9

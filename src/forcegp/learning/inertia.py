@@ -514,22 +514,47 @@ def with_updated_robot(problem: Problem, values: Mapping[str, Tensor]) -> Proble
     """Return the problem with the inertial parameters at their posterior mean (one Gauss–Newton step)."""
     for p, prior in enumerate(problem.priors):
         moves = not prior.is_error and problem.parameters is None
-        if isinstance(prior, InertialPrior) and moves and not prior.drives:
-            posterior = force_posterior(problem, values)
+        if isinstance(prior, InertialPrior) and moves:
+            file, posterior = problem.system.robot, force_posterior(problem, values)
             features = one_row(posterior, problem)
             mean = posterior.latent.latent_mean(p, features[p])[0]
-            precision = latent_precision(posterior, features, p, problem.system.robot)
-            volume = _log_volume(problem, values)
-            robot, _ = prior.updated(problem.system.robot, mean, precision, volume)
+            precision = latent_precision(posterior, features, p, file)
+            robot = _moved(file, prior, mean, precision, _log_volume(problem, values))
             # The prior keeps the scale of the parameters in the file, not of the updated ones.
-            errors = dataclasses.replace(prior.around(problem.system.robot), is_error=True)
+            errors = dataclasses.replace(prior.around(file), is_error=True)
             moved = problem.without_priors([prior.name]).with_priors([errors], problem)
             return dataclasses.replace(moved, system=problem.system.with_robot(robot))
     return problem
 
 
-def _log_volume(problem: Problem, values: Mapping[str, Tensor]) -> Callable[[RobotModel], Tensor]:
-    """Return robot ↦ κ Σ_i log |M (Σ_τ + M Σ_q̈ Mᵀ)^−½| over the samples in free motion.
+def _moved(
+    robot: RobotModel,
+    prior: InertialPrior,
+    mean: Tensor,
+    precision: Tensor,
+    log_volume: Callable[[RobotModel], Tensor] | None,
+) -> RobotModel:
+    """Return the robot with physically consistent links and then, given these, nonnegative drive inertia."""
+    count = len(mean) - len(prior.drives)
+    links, drives = torch.arange(count), torch.arange(count, len(mean))
+    moved, delta = prior.updated(
+        robot, mean[links], _marginal(precision, links, drives), log_volume, STATED if prior.drives else None
+    )
+    if not prior.drives:
+        return moved
+    # ½ (u − û)ᵀ P (u − û) over the drives u ≥ −d₀, given the links
+    size = robot.mass.new_tensor(prior.drives)
+    L = torch.linalg.cholesky(precision[drives][:, drives])
+    h = precision[drives] @ mean - precision[drives][:, links] @ delta
+    right = torch.linalg.solve_triangular(L, h[:, None], upper=False)[:, 0]
+    lower = torch.where(size > 0.0, -robot.armature / size.clamp(min=1e-300), -math.inf)
+    bounds = lower.cpu().numpy(), math.inf
+    u = scipy.optimize.lsq_linear(L.mT.cpu().numpy(), right.cpu().numpy(), bounds, method="bvls").x
+    return moved.replace(armature=(robot.armature + size * torch.from_numpy(u).to(size)).clamp(min=0.0))
+
+
+def _log_volume(problem: Problem, values: Mapping[str, Tensor]) -> Callable[[RobotModel], Tensor] | None:
+    """Return robot ↦ κ Σ_i log |M (Σ_τ + M Σ_q̈ Mᵀ)^−½| over the samples in free motion, `None` without any.
 
     This term converts the density of the torque error to that of the acceleration error. Without it, a robot
     with almost no inertia would best explain small torques, whatever the resulting accelerations.
@@ -557,7 +582,7 @@ def _log_volume(problem: Problem, values: Mapping[str, Tensor]) -> Callable[[Rob
             total = total + weight * (torch.logdet(M) - 0.5 * torch.logdet(C)).sum()
         return total
 
-    return volume
+    return volume if terms else None
 
 
 def one_row(posterior: ForcePosterior, problem: Problem) -> list[dict[str, Tensor]]:
