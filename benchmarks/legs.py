@@ -3,6 +3,7 @@
     python benchmarks/legs.py --json legs.json            # three robots, three frictions, two seeds
     python benchmarks/legs.py --robot solo12 --friction coulomb --seeds 0
     python benchmarks/legs.py --case touchdown         # labels of closed feet from an imported log
+    python benchmarks/legs.py --case rollout --robot solo12 --friction coulomb --seeds 0
 
 The true robot has joint friction, a payload of a tenth of its mass on the trunk, and links that differ from
 the file by 5 %. Torques, encoders and the IMU are noisy. Training logs hold standing, swaying and a trot;
@@ -19,6 +20,9 @@ swaying.
 compares touch-down and lift-off with the engine's. A flight is an interval of 50 ms or more without force.
 The first second, in which steps grow from zero, counts separately. Encoders are noisy, and the base is either
 exact or that of an estimator, which is off by 5 mm.
+
+`--case rollout` predicts half a second of a gait and a hop from single states, with the servos as a feedback
+law, with the fit and with the robot file. Errors are the RMS over this time.
 """
 
 from __future__ import annotations
@@ -48,6 +52,7 @@ import forcegp
 from forcegp.errors import optional_module
 from forcegp.kinematics import frame_jacobian
 from forcegp.logs import import_log, parse_mapping
+from forcegp.rollout import RolloutOptions
 from forcegp.rows import intervals
 
 mujoco = optional_module("mujoco", "This benchmark")
@@ -60,7 +65,9 @@ HARD = 0.002
 friction depends on their acceleration."""
 STEP, RATE = 0.0005, 500
 """Time step of the engine [s] and rate of the log [Hz]."""
-SECONDS = {"train": 20.0, "test": 10.0, "labels": 30.0}
+SECONDS = {"train": 20.0, "test": 10.0, "labels": 30.0, "rollout": 4.0}
+STICKS, ROLLED, STARTS = 0.02, 0.5, (1.2, 1.8, 2.4, 3.0)
+"""Speed below which feet stick [m/s], and duration and starts [s], in rollouts."""
 EVERY, TESTED = 5, 5
 """Every so many rows are learned from, and tested."""
 LINKS, PAYLOAD = 0.05, 0.1
@@ -294,6 +301,24 @@ class Legged:
             return np.clip(0.5 + np.array([0.5, -0.5]) * y / apart, 0.0, 1.0)
 
         return Gait(wanted, share)
+
+    def hop(self) -> Gait:
+        """All feet push off together; quadrupeds are in the air for a third of the time."""
+        home, size = self.standing_feet(), np.array([0.0, 0.0, 0.12])
+        return Gait(lambda t: home * (1.0 - size * min(1.0, t) * np.cos(6.0 * np.pi * t)))
+
+    def servo(self, gait: Gait, start: float) -> Callable[..., torch.Tensor]:
+        """Torques of the servos for t, q and q̇ after the start, as a feedback law for rollouts."""
+        times = start + np.arange(round(2.0 * ROLLED * RATE)) / RATE
+        targets = torch.from_numpy(self.angles(gait.places, times))
+        speeds = torch.diff(targets, dim=0, prepend=targets[:1]) * RATE
+
+        def law(t: torch.Tensor, q: torch.Tensor, qd: torch.Tensor) -> torch.Tensor:
+            k = (t[:, 0] * RATE + 1e-6).long()
+            error = targets[k] - q[:, 6:] + self.kind.damping * (speeds[k] - qd[:, 6:])
+            return torch.nn.functional.pad(self.kind.stiffness * error, (6, 0))
+
+        return law
 
     def pushed(self) -> Callable[[float], Array]:
         """Half sines of random sizes and directions, each for half a second."""
@@ -535,11 +560,11 @@ def of_legs(legged: Legged, system: forcegp.ConstrainedSystem, data: forcegp.Dat
     return torch.cat(own, dim=1)[..., 0]
 
 
-def system_of(legged: Legged) -> forcegp.ConstrainedSystem:
+def system_of(legged: Legged, stick_speed: float | None = None) -> forcegp.ConstrainedSystem:
     """The robot file and its feet on the floor."""
     floor, radius = forcegp.Plane(offset=0.0), legged.kind.radius
     balls = [
-        forcegp.SurfaceContact(x, foot, ball, floor, radius=radius)
+        forcegp.SurfaceContact(x, foot, ball, floor, radius=radius, stick_speed=stick_speed)
         for x, (foot, ball) in legged.contacts.items()
     ]
     return forcegp.ConstrainedSystem(legged.robot, balls)
@@ -754,11 +779,32 @@ def touchdown(name: str, friction: str, seed: int) -> list[dict[str, Any]]:
     return results
 
 
+def rollouts(name: str, friction: str, seed: int) -> list[dict[str, Any]]:
+    """Errors over half a second from states of the gait that is learned from, and of a hop."""
+    legged, results = Legged(name, friction, seed), []
+    system, gait = system_of(legged, STICKS), next(iter(gaits(legged).values()))
+    parts = [(legged.sway(), 0.4 * SECONDS["train"]), (gait, 0.6 * SECONDS["train"])]
+    train = forcegp.Dataset.concatenate([dataset(legged, legged.record(*part)) for part in parts])
+    fit = forcegp.StructuredGP(system).fit(train[::EVERY])
+    models = {"fit": fit, "file": forcegp.AnalyticalModel(system).nominal()}
+    options = RolloutOptions(dt=1.0 / RATE, unilateral=True, sticking=False)
+    for (motion, wanted), start in itertools.product({"gait": gait, "hop": legged.hop()}.items(), STARTS):
+        data = dataset(legged, legged.record(wanted, SECONDS["rollout"]))
+        first, law = round(start * RATE), legged.servo(wanted, start)
+        for label, model in models.items():
+            path = model.rollout(data.q[first], data.qd[first], law, duration=ROLLED, options=options)
+            e = (path.q - data.q[first : first + len(path.q)]).square().mean(0)
+            columns = {"base_mm": slice(3), "base_mrad": slice(3, 6), "joints_mrad": slice(6, None)}
+            sizes = {key: 1e3 * float(e[part].mean().sqrt()) for key, part in columns.items()}
+            results.append({"motion": motion, "start_s": start, "model": label} | sizes)
+    return results
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--case", choices=("forces", "touchdown"), default="forces")
+    parser.add_argument("--case", choices=("forces", "touchdown", "rollout"), default="forces")
     parser.add_argument("--robot", choices=tuple(ROBOTS), action="append")
     parser.add_argument("--friction", choices=FRICTIONS, action="append")
     parser.add_argument("--seeds", type=int, nargs="*", default=[0, 1])
@@ -770,6 +816,8 @@ def main() -> None:
     head = ["case", "RMSE [N]", "÷ legs", "÷ equations", "÷ identified", "coverage of ±2σ"]
     if options.case == "touchdown":
         head = ["case", "within 10 ms", "false per minute", "touch-down [ms]", "lift-off [ms]", "rows"]
+    if options.case == "rollout":
+        head = ["case", "base [mm]", "base [mrad]", "joints [mrad]"]
     results, lines = [], []
     for seed, name, friction in itertools.product(options.seeds, robots, frictions):
         label, of = f"{name}, {friction}, {seed}", {"robot": name, "friction": friction, "seed": seed}
@@ -782,6 +830,13 @@ def main() -> None:
                 shares = f"{each['found']:.3f} of {each['switches']}", f"{each['false_per_minute']:.0f}"
                 more = f"{each['rows_agree']:.3f}"
                 lines.append([f"{label}, {each['gait']}, {each['base']}", *shares, down, up, more])
+                print(lines[-1], flush=True)
+            continue
+        if options.case == "rollout":
+            for each in rollouts(name, friction, seed):
+                results.append(of | each)
+                sizes = [f"{each[key]:.1f}" for key in ("base_mm", "base_mrad", "joints_mrad")]
+                lines.append([f"{label}, {each['motion']}, {each['start_s']:.1f} s, {each['model']}", *sizes])
                 print(lines[-1], flush=True)
             continue
         scores = case(name, friction, seed)
