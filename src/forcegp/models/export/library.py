@@ -364,11 +364,7 @@ class CompiledFit(Predictor):
         """
         names = surface_contacts(self.system, None)
         arrays, batch = self._measured((q, qd, tau, qdd), active, qdd_std, AXES * len(names))
-        pointers = [None if x is None else x.data_ptr() for x in arrays]
-        status = self.library.forcegp_contact_force(self._memory, batch.numel(), *pointers)
-        if status:
-            raise KINDS.get(status, NumericalError)(MESSAGES[status])
-        mean, covariance, beyond = arrays[-3:]
+        mean, covariance, beyond = self._filled("contact_force", arrays, batch)
         far = beyond if LOW in self.model.tensors else None
         parts, joints = parts_of_contacts(names), self.system.robot.joint_names
         return Prediction(mean, covariance, parts, far, joints, checked=True)
@@ -391,6 +387,16 @@ class CompiledFit(Predictor):
         outputs = (q.new_empty(*flat.batch, *shape) for shape in ((k,), (k, k), (nq,)))
         return (*inputs, std, *outputs), flat.batch
 
+    def _filled(
+        self, name: str, arrays: tuple[Any, ...], batch: torch.Size, more: tuple[Tensor | None, ...] = ()
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Call a function of the library on the arrays of `_measured`, and return the three outputs."""
+        pointers = [None if x is None else x.data_ptr() for x in (*arrays, *more)]
+        status = getattr(self.library, f"forcegp_{name}")(self._memory, batch.numel(), *pointers)
+        if status:
+            raise KINDS.get(status, NumericalError)(MESSAGES[status])
+        return arrays[-3:]
+
     def _wrench(
         self, state: Sequence[Tensor], active: Tensor | None, qdd_std: Tensor | None, differentiate: bool
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -403,11 +409,8 @@ class CompiledFit(Predictor):
         k, q = len(self.model.wrench.axes), state[0]
         arrays, batch = self._measured(state, active, qdd_std, k)
         slopes = q.new_empty((*batch, k, 4, q.shape[-1]) if differentiate else (0, k, 4, q.shape[-1]))
-        pointers = [None if x is None else x.data_ptr() for x in (*arrays, slopes if differentiate else None)]
-        status = self.library.forcegp_external_wrench(self._memory, batch.numel(), *pointers)
-        if status:
-            raise KINDS.get(status, NumericalError)(MESSAGES[status])
-        mean, covariance, beyond = arrays[-3:]
+        more = (slopes if differentiate else None,)
+        mean, covariance, beyond = self._filled("external_wrench", arrays, batch, more)
         return mean, covariance, beyond, slopes
 
     def linearize(
