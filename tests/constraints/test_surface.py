@@ -151,3 +151,15 @@ def test_the_normal_is_scaled_to_unit_length() -> None:
     plane = forcegp.Plane((0, 0, 4), 0.2)
     assert plane.normal == (0.0, 0.0, 1.0)
     assert float(plane.value(torch.tensor([9.0, 9.0, 0.5], dtype=torch.float64))) == pytest.approx(0.3)
+
+
+def test_a_subclass_with_its_own_value_does_not_keep_the_geometry_of_its_parent() -> None:
+    class Floor(Plane):
+        def value(self, p: Tensor) -> Tensor:
+            return super().value(p) - 0.1
+
+    floor = Floor((0.0, 0.0, 1.0), 0.0)
+    assert Plane((0.0, 0.0, 1.0), 0.0).solid() is not None
+    assert floor.solid() is None and not floor.has_scalars
+    with pytest.raises(ForceGPError, match="cannot be offset"):
+        floor.raised(0.1)

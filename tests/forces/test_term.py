@@ -160,6 +160,56 @@ def test_a_law_with_the_name_of_another_is_refused(tmp_path: Path) -> None:
     torch.testing.assert_close(again.predict(*state).mean, fit.predict(*state).mean, rtol=SAME, atol=SAME)
 
 
+CELL = """
+@dataclass(frozen=True)
+class Cell(JointTerm):
+    kernel: Kernel = field(default_factory=Columns)
+    name: str = "residual"
+
+    def columns(self, x):
+        return {"load": x.qd, "dry": x.direction()}
+"""
+
+
+def test_a_law_that_a_notebook_defines_again_is_saved(tmp_path: Path) -> None:
+    """Its name is that of a prior of the library, and one of its columns that of a column of a library law."""
+    system, data = log(7, 300)
+    exec(CELL, globals())
+    model = forcegp.StructuredGP(system, "analytical", [globals()["Cell"]()]).fit(data)
+    exec(CELL, globals())
+    path = tmp_path / "model.safetensors"
+    model.save(path)
+    again, states = forcegp.load_model(path), (data.q, data.qd, data.tau)
+    assert torch.equal(again.predict(*states).mean, model.predict(*states).mean)
+    assert model.parameters()[0].unit == "N m per unit of load"
+    exec(CELL.replace("x.qd,", "x.qd * abs(x.qd),"), globals())
+    with pytest.raises(ModelError, match="not those that the model was fitted with"):
+        forcegp.load_model(path)
+
+
+@pytest.mark.parametrize(
+    "column",
+    ["1.0", "x.qd[:, 0]", "logarithm(x.qd)"],
+    ids=["number", "one joint", "not a number"],
+)
+def test_columns_that_are_not_valid_are_named_before_the_fit(column: str) -> None:
+    system, _ = log(7, 300)
+    exec(CELL.replace("x.qd,", f"{column},"), globals())
+    with pytest.raises(ModelError, match="column 'load' of force prior 'residual' is not valid"):
+        forcegp.StructuredGP(system, "analytical", [globals()["Cell"]()])
+
+
+def test_a_law_without_a_kernel_is_refused() -> None:
+    system, _ = log(7, 300)
+
+    class Plain(JointTerm):
+        def columns(self, x: JointState) -> dict[str, Array]:
+            return {"viscous": x.qd}
+
+    with pytest.raises(ModelError, match="Plain is not a valid force prior"):
+        forcegp.StructuredGP(system, "analytical", [Plain()])
+
+
 def test_compiled_code_and_casadi_read_the_same_lines(fit, tmp_path: Path) -> None:
     _, test = log(2, 20)
     state = test.q, test.qd, test.tau

@@ -11,6 +11,7 @@ from forcegp.constraints import Baumgarte, ConstrainedSystem
 from forcegp.data import Dataset
 from forcegp.errors import DataError, ModelError
 from forcegp.forces.posterior import draw_samples
+from forcegp.forces.priors.joint import JointFrictionPrior
 from forcegp.forces.priors.sets import default_priors
 from forcegp.forces.quantities import states
 from forcegp.gp.optimise import LearningOptions
@@ -121,6 +122,19 @@ def test_probability_of_lost_contact_is_that_of_the_posterior_draws() -> None:
     )
     share = (draws < 0.0).double().mean(0)
     assert torch.allclose(contact_loss_probability(model, q, qd, tau), share, atol=0.02)
+
+
+def test_a_contact_that_sticks_is_lost_by_its_normal_force_alone() -> None:
+    data, system = log(), fitted("zero").system
+    held = [dataclasses.replace(contact, stick_speed=0.005) for contact in system.contacts]
+    held = ConstrainedSystem(system.robot, held, system.baumgarte)
+    model = StructuredGP(held, "analytical", [JointFrictionPrior()], noise=0.1).fit(data[:400])
+    q, tau = data.q[:3], data.tau[:3]
+    found = model.predict(q, torch.zeros_like(q), tau, "multiplier")
+    assert found.std is not None and bool((found.mean < 0.0).any())
+    loss = contact_loss_probability(model, q, torch.zeros_like(q), tau)
+    expected = torch.distributions.Normal(found.mean[:, :1], found.std[:, :1]).cdf(torch.zeros(1).double())
+    assert torch.allclose(loss, expected, atol=1e-12)
 
 
 def test_a_contact_that_is_open_is_lost() -> None:

@@ -293,3 +293,22 @@ def test_friction_is_found_where_exchanging_joints_goes_round_in_circles() -> No
     assert held[0].tolist() == [False, False, True] and float(motion[2].abs()) < 1e-5
     assert bool((force[0].abs() <= limit + 1e-9).all())
     torch.testing.assert_close(force[0, :2], -motion[:2].sign() * limit[:2])
+
+
+@pytest.mark.parametrize("dt", [1e-2, 5e-3])
+def test_a_motion_and_its_mirror_image_are_the_same(dt: float) -> None:
+    """Light links with friction that falls with the speed: damping acts at the end of a step."""
+    robot = forcegp.load_robot("double_pendulum")
+    one = torch.ones_like(robot.friction)
+    robot = robot.replace(mass=0.02 * robot.mass, inertia=0.02 * robot.inertia, damping=0.02 * one)
+    robot = robot.replace(friction=0.05 * one, stribeck=0.5 * one, stribeck_velocity=0.05 * one)
+    fit = forcegp.AnalyticalModel(forcegp.ConstrainedSystem(robot)).nominal()
+    start = pair(0.3, 0.2), pair(0.5, 0.3)
+
+    def swing(sign: float) -> Tensor:
+        def push(t: float, q: Tensor, qd: Tensor) -> Tensor:
+            return sign * pair(0.9, 0.6) * torch.cos(torch.as_tensor(6.0 * t, dtype=q.dtype))
+
+        return fit.rollout(*(sign * x for x in start), push, 0.5, options=RolloutOptions(dt=dt)).q
+
+    assert torch.allclose(swing(1.0), -swing(-1.0), atol=1e-9)

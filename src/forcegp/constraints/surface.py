@@ -52,8 +52,10 @@ class Surface(ABC):
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
-        if "value" in cls.__dict__ and "scalars" not in cls.__dict__:
-            cls.scalars = Surface.scalars
+        # What a class inherits describes another surface, if it has its own value.
+        for name in ("scalars", "solid", "raised") if "value" in cls.__dict__ else ():
+            if name not in cls.__dict__:
+                setattr(cls, name, getattr(Surface, name))
         cls.has_scalars = cls.scalars is not Surface.scalars
 
     has_scalars = False
@@ -82,7 +84,7 @@ class Surface(ABC):
         """
         raise ParameterError(
             f"{type(self).__name__} cannot be offset by {distance} m",
-            expected="a plane, a sphere or a cylinder, whose c is the signed distance",
+            expected="a surface whose c is the signed distance",
             hint="define raised() in a subclass",
         )
 

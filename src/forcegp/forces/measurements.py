@@ -432,7 +432,8 @@ def _by_contact(name: str) -> Callable[[Dataset, ConstrainedSystem], Tensor]:
         for contact in system.contact_names:
             if contact not in logged:
                 raise UnknownNameError(f"contact with a logged {name}", contact, logged)
-            if name == "multiplier" and logged[contact].ndim < system.contact(contact).rows - 1:
+            sticks = system.contact(contact).rows > 1
+            if name == "multiplier" and sticks and logged[contact].ndim == 1:
                 raise ModelError(
                     f"contact {contact!r} may stick, and only its normal force is logged",
                     expected="three components",

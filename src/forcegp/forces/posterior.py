@@ -50,6 +50,8 @@ OUTERMOST, WIDEST = 0.01, 0.16
 """Smallest and largest fraction of the training samples beyond each limit of the region. The largest is the
 tail of a Gaussian beyond one standard deviation. At least one independent sample lies beyond.
 """
+SLOWEST = 1e-3
+"""Least standard deviation of a joint's speed [rad/s, m/s], below the noise of computed velocities."""
 UNLOADED = 1e-6
 """Least load of a joint, relative to the largest: a free base may have neither torque nor load."""
 RELATIVE = 0.05
@@ -191,7 +193,7 @@ def trained_region(qd: Tensor, tau: Tensor, load: Tensor, independent: float = m
     share = min(max(OUTERMOST, 1.0 / independent), WIDEST)
     low, high = x.quantile(torch.tensor([share, 1.0 - share]).to(x), dim=0)
     load = load.maximum(UNLOADED * load.max()).clamp(min=1e-12)
-    least = torch.stack([torch.full_like(load, STICKING), RELATIVE * load])
+    least = torch.stack([torch.full_like(load, SLOWEST), RELATIVE * load])
     spread = x.std(0, correction=0).maximum(least)
     return {LOW: low, HIGH: high, SPREAD: spread}
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import Field, dataclass
 from typing import Any, ClassVar
 
 import numpy as np
@@ -28,6 +28,8 @@ Array = Any
 SPEEDS = (0.02, 0.1, 0.5)
 """Saturation speeds of dry friction [rad/s, m/s]: a sharp step and two more gradual transitions."""
 SHARPEST = SPEEDS[0]
+FORCE = ("N m", "N")
+"""Units of forces of revolute and of sliding joints."""
 
 
 def exp(x: Array) -> Array:
@@ -152,10 +154,14 @@ class JointTerm(PerJointPrior):
     sticks = True
     laws: ClassVar[dict[str, type[JointTerm]]] = {}
     """All terms, by the names under which they are saved."""
+    units: ClassVar[Mapping[str, tuple[str, str]]] = {}
+    """Units of the weights of columns, for revolute and for sliding joints, by the first letters of the names
+    of the columns. Other weights are in N m or N per unit of their column."""
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
         name = cls.__dict__.get("name")
+        name = name.default if isinstance(name, Field) else name
         if not isinstance(name, str):
             return
         other = JointTerm.laws.get(name, cls)
@@ -172,6 +178,28 @@ class JointTerm(PerJointPrior):
 
         They may use arithmetic, `abs`, and the functions of this module, which C and CasADi have too.
         """
+
+    def check(self, system: ConstrainedSystem) -> None:
+        """Raise `ModelError` if a column is not valid at rest or in motion."""
+        self.probe(system)
+
+    def probe(self, system: ConstrainedSystem) -> Tensor:
+        """Return the columns at three states of each joint `(c, 3, nq)`, one of them at rest.
+
+        Raises:
+            ModelError: a column is not finite, or of the wrong shape.
+        """
+        x = system.robot.mass.new_tensor([[0.0], [-0.1], [2.0]]).expand(-1, system.robot.nq)
+        columns = self.columns(JointState(x, x, x.abs()))
+        for name, column in columns.items():
+            found = tuple(column.shape) if isinstance(column, Tensor) else repr(column)
+            if found != x.shape or not bool(column.isfinite().all()):
+                raise ModelError(
+                    f"column {name!r} of force prior {self.name!r} is not valid",
+                    expected="finite values of the shape of x.qd, also at rest and for negative q and q̇",
+                    got="NaN or infinity" if found == x.shape else found,
+                )
+        return torch.stack([*columns.values()]) if columns else x[:0]
 
     def features(self, system: ConstrainedSystem, at: States) -> dict[str, Tensor]:
         robot = system.robot

@@ -17,7 +17,7 @@ from forcegp.forces.posterior import ForcePosterior
 from forcegp.forces.priors.base import ForcePrior
 from forcegp.forces.priors.constants import DrivePrior
 from forcegp.forces.priors.inertial import InertialPrior, PayloadPrior
-from forcegp.forces.term import JointTerm
+from forcegp.forces.term import FORCE, JointTerm
 from forcegp.gp.kernels import Constant, Linear, sub
 from forcegp.gp.sparse import SparsePosterior
 from forcegp.identification import PARAMETER_NAMES
@@ -27,10 +27,6 @@ DETERMINED = 0.5
 """Standard deviation relative to that of the prior, below which a parameter is determined by the data."""
 SCALE = ".scale of "
 """Text between the name of a prior and that of a joint whose torque has a scale."""
-UNITS = {"velocity": ("N m s/rad", "N s/m"), "load": ("1", "1")}
-"""Units of weights of columns with a unit, for revolute and for sliding joints."""
-WITHOUT_UNIT = ("coulomb_", "z_", "sin_", "cos_", "offset")
-"""First letters of columns without a unit, whose weights are forces."""
 INERTIAL = ("kg", "kg m", "kg m", "kg m", *6 * ("kg m²",))
 
 
@@ -100,9 +96,8 @@ def _of_prior(
                 continue
             kind = int(robot.joint_types[j] != "revolute")
             for c, name in enumerate(names):
-                units = UNITS.get(name, ("N m", "N"))[kind]
-                if name not in UNITS and not name.startswith(WITHOUT_UNIT):
-                    units = f"{units} per unit of {name}"
+                stated = (pair[kind] for start, pair in prior.units.items() if name.startswith(start))
+                units = next(stated, f"{FORCE[kind]} per unit of {name}")
                 yield _parameter(f"{prior.name}.{name} of {joint}", w[j, c], std[j, c], unit[j, c], units)
     if isinstance(prior, DrivePrior) and isinstance(prior.kernel, Constant):
         for k, joint in enumerate(robot.joint_names):

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 import torch
@@ -77,7 +77,8 @@ those of the library because `forcegp.priors` imports them."""
 
 def classes() -> dict[str, type]:
     """Return the classes that can be saved, by their names in the file."""
-    return {**JointTerm.laws, **CLASSES}
+    laws = {f"law:{name}" if name in CLASSES else name: law for name, law in JointTerm.laws.items()}
+    return {**CLASSES, **laws}
 
 
 COLUMNS = ("q", "qd", "tau", "active", "values")
@@ -156,6 +157,7 @@ def pack(
     stated = spec.noise
     noise = {**vars(stated), "acceleration": plain(stated.acceleration), "torque": plain(stated.torque)}
     noise["state"] = None if stated.state is None else tuple(map(plain, stated.state))
+    tensors |= {f"law.{law.name}": law.probe(spec.system) for law in _laws(problem.priors)}
     settings = StructuredSettings(
         **dict(spec.options),
         mean=spec.mean.terms,
@@ -186,6 +188,11 @@ def _conditioned_on(spec: Specification, training: Training, posterior: ForcePos
     return tensors
 
 
+def _laws(priors: Sequence[ForcePrior]) -> list[JointTerm]:
+    """Return the laws that do not belong to the library."""
+    return [x for x in priors if isinstance(x, JointTerm) and not type(x).__module__.startswith("forcegp.")]
+
+
 def _columns(spec: Specification) -> tuple[str, ...]:
     """Return the saved parts of each measurement."""
     several = any(isinstance(prior, PerRecording | OffsetPrior) for prior in spec.priors)
@@ -212,6 +219,13 @@ def unpack(
     """
     settings = header.settings_as(StructuredSettings, source)
     spec = _specification(settings, tensors, system, source)
+    for law in _laws(spec.priors):
+        saved, now = tensors.get(f"law.{law.name}"), law.probe(system)
+        if saved is not None and not (saved.shape == now.shape and torch.allclose(saved, now, rtol=1e-9)):
+            raise ModelError(
+                f"{source}: the columns of {law.name!r} are not those that the model was fitted with",
+                hint=f"restore the lines of {type(law).__name__}, or fit the model again",
+            )
     try:
         _check_types(tensors)
         training = _training(settings, spec, tensors)

@@ -149,9 +149,9 @@ def _listed(problem: RolloutProblem, state: State, crossed: Tensor) -> list[Cont
 def contact_loss_probability(
     model: ForwardModel, q: Tensor, qd: Tensor, tau: Tensor, *, active: Tensor | None = None
 ) -> Tensor:
-    """Return the probability `(*batch, m)` that λ < 0, so that the contact opens, at states `(*batch, nq)`.
+    """Return the probability `(*batch, n_contacts)` that each contact opens at states `(*batch, nq)`.
 
-    P(λ < 0) = Φ(−μ/σ) for the posterior N(μ, σ²) of the multiplier, and 1 for an open contact. `active` is a
+    P(λ < 0) = Φ(−μ/σ) for the posterior N(μ, σ²) of its normal multiplier, 1 for an open contact. `active` is a
     mask `(*batch, n_contacts)` of closed contacts. By default, all contacts are closed.
 
     Raises:
@@ -163,8 +163,9 @@ def contact_loss_probability(
             f"a {model.kind!r} model does not predict the uncertainty of the multiplier",
             hint="use StructuredGP, or compare the predicted multiplier with zero",
         )
-    certain = prediction.std == 0.0
-    probability = torch.special.ndtr(-prediction.mean / torch.where(certain, 1.0, prediction.std))
-    probability = torch.where(certain, (prediction.mean < 0.0).to(probability.dtype), probability)
     closed = model.system.active_rows(active, prediction.mean.shape[:-1])
+    mean, std, closed = (normal_rows(model.system, x) for x in (prediction.mean, prediction.std, closed))
+    certain = std == 0.0
+    probability = torch.special.ndtr(-mean / torch.where(certain, 1.0, std))
+    probability = torch.where(certain, (mean < 0.0).to(probability.dtype), probability)
     return torch.where(closed, probability, 1.0)

@@ -112,14 +112,18 @@ def split(system: ConstrainedSystem, at: States, force: ForceField) -> DryFricti
     sticking = [p for p, prior in enumerate(priors) if prior.sticks]
     others = [p for p, prior in enumerate(priors) if not prior.sticks]
 
-    def sliding(direction: float, faster: float = 0.0) -> Tensor:
-        moved = dataclasses.replace(at, slip=torch.full_like(at.qd, direction), qd=at.qd + faster)
+    def sliding(direction: Tensor, faster: float = 0.0) -> Tensor:
+        moved = dataclasses.replace(at, slip=direction, qd=at.qd + faster * direction)
         force = mean(system, moved)
         return force if unknown is None else force + unknown.unknown_force(system, moved, sticking)
 
     # Only friction uses the changed speed; the other terms are taken from the equations of motion.
-    forward, backward = sliding(1.0), sliding(-1.0)
-    damping = ((forward - sliding(1.0, NUDGE)) / NUDGE).clamp(min=0.0)
+    one = torch.ones_like(at.qd)
+    forward, backward = sliding(one), sliding(-one)
+    # D = −∂Q/∂q̇ for joints that slide the way s they move: s (Q(q̇) − Q(q̇ + s ε))/ε
+    way = torch.where(at.qd < 0.0, -one, one)
+    slower = torch.where(at.qd < 0.0, backward, forward)
+    damping = (way * (slower - sliding(way, NUDGE)) / NUDGE).clamp(min=0.0)
     limit = 0.5 * (backward - forward)
     Q = 0.5 * (forward + backward) + limit.clamp(max=0.0).neg() * torch.tanh(at.qd / SMOOTH)
     if unknown is not None:

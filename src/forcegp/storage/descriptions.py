@@ -27,10 +27,11 @@ _CHECK = ConfigDict(arbitrary_types_allowed=True, strict=True, allow_inf_nan=Fal
 
 def encode(value: Any, classes: Classes) -> Any:
     """Return a description as JSON-compatible values; raise `ModelError` if a class has no JSON form."""
-    names = {kind: name for name, kind in classes.items()}
-    if type(value) in names:
+    # A notebook defines a class again when its cell runs again.
+    names = {(kind.__module__, kind.__qualname__): name for name, kind in classes.items()}
+    if name := names.get((type(value).__module__, type(value).__qualname__)):
         members = {field.name: encode(getattr(value, field.name), classes) for field in _written(value)}
-        return {"type": names[type(value)], **members}
+        return {"type": name, **members}
     if isinstance(value, tuple | list):
         return [encode(part, classes) for part in value]
     if value is None or isinstance(value, str | int | float | bool):

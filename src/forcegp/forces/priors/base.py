@@ -121,6 +121,14 @@ def check_priors(priors: tuple[ForcePrior, ...], system: ConstrainedSystem) -> N
                 got=repr(prior),
                 hint="omit force_priors for all terms that apply to the log",
             )
+        kernel, name = (getattr(prior, key, None) for key in ("kernel", "name"))
+        if not isinstance(kernel, Kernel) or not isinstance(name, str):
+            raise ModelError(
+                f"{type(prior).__name__} is not a valid force prior",
+                expected="a kernel and a name",
+                got=f"kernel {kernel!r} and name {name!r}",
+                hint="give the class both fields, and decorate it with @dataclass(frozen=True)",
+            )
     names = [prior.name for prior in priors]
     if not names or len(set(names)) != len(names):
         raise ModelError("force priors need distinct names, and at least one prior", got=names)

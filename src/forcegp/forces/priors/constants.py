@@ -16,7 +16,7 @@ from forcegp.errors import ModelError
 from forcegp.forces.priors.base import JOINT, ForcePrior
 from forcegp.forces.priors.joint import OFFSET, ConstantForcePrior
 from forcegp.forces.quantities import States
-from forcegp.forces.term import Array, JointState, JointTerm, constants
+from forcegp.forces.term import FORCE, Array, JointState, JointTerm, constants
 from forcegp.gp.kernels import Columns, Constant, Kernel
 from forcegp.robot.model import RobotModel
 
@@ -106,6 +106,7 @@ class OffsetPrior(JointTerm):
 
     sticks = False
     scaled = False
+    units = {"offset": FORCE}
 
     def columns(self, x: JointState) -> dict[str, Array]:
         every, zero = np.array(self.separable, dtype=float), x.qd * 0.0

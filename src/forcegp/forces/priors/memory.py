@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from forcegp.data.fields import in_time
-from forcegp.forces.term import SPEEDS, Array, JointState, JointTerm, constants
+from forcegp.forces.term import FORCE, SPEEDS, Array, JointState, JointTerm, constants
 from forcegp.gp.kernels import Columns, Kernel
 
 DISTANCES = (0.003, 0.01, 0.03, 0.1)
@@ -52,6 +52,7 @@ class BristlePrior(JointTerm):
     expected: tuple[tuple[tuple[float, ...], ...], ...] = ()
 
     remembers = True
+    units = {"z_": FORCE}
 
     def columns(self, x: JointState) -> dict[str, Array]:
         count = len(DISTANCES)

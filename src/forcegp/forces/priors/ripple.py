@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import max_pool1d
 
-from forcegp.forces.term import Array, JointState, JointTerm, constants, cos, sin
+from forcegp.forces.term import FORCE, Array, JointState, JointTerm, constants, cos, sin
 from forcegp.gp.kernels import Columns, Kernel
 
 MOST_WAVES = 4
@@ -53,6 +53,8 @@ class RipplePrior(JointTerm):
     waves: tuple[tuple[float, ...], ...] = ()
     kernel: Kernel = field(default_factory=Columns)
     name: str = "ripple"
+
+    units = {"sin_": FORCE, "cos_": FORCE}
 
     def columns(self, x: JointState) -> dict[str, Array]:
         columns = {}

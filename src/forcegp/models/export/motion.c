@@ -95,11 +95,11 @@ static void add_waves(const waves *w, const equations *e, long sample, int stick
   }
 }
 
-/* friction of joints that slide in a given direction, at a speed increased by `more` */
-static int slide(const double *q, const double *qd, const double *tau, const waves *w, long sample, double way, double more,
-                 const double *gain, equations *e, latent *f, double *force) {
+/* friction of joints that slide in given directions, at speeds increased by `more` */
+static int slide(const double *q, const double *qd, const double *tau, const waves *w, long sample, const double *way,
+                 double more, const double *gain, equations *e, latent *f, double *force) {
   double slip[NQ], speed[NQ], sine[NQ], cosine[NQ], out[@outputs@];
-  for (int i = 0; i < NQ; ++i) slip[i] = way, speed[i] = qd[i] + more, sine[i] = sin(q[i]), cosine[i] = cos(q[i]);
+  for (int i = 0; i < NQ; ++i) slip[i] = way[i], speed[i] = qd[i] + more * way[i], sine[i] = sin(q[i]), cosine[i] = cos(q[i]);
   sliding(q, speed, tau, slip, sine, cosine, out);
 @copies@  if (sticking_forces(q, speed, tau, e, gain, 0, f) != 0) return FORCEGP_JAMMED;
   add_waves(w, e, sample, 1, f);
@@ -129,13 +129,16 @@ static int motion(const double *folded, const waves *w, long sample, const doubl
   for (int r = 0; r < ROWS; ++r) c[r] = e.contact[r].c, cd[r] = dot(e.contact[r].A, qd, NQ);
   size = maps(&e, gain, FORCEGP_QDD | FORCEGP_MULTIPLIER, &z);
   if (sticking) { /* Q(s) with the direction s of friction: Q = (Q(1) + Q(-1)) / 2 - F s */
-    if ((status = slide(q, qd, tau, w, sample, 1.0, NUDGE, gain, &e, &f, faster)) != 0) return status;
-    if ((status = slide(q, qd, tau, w, sample, 1.0, 0.0, gain, &e, &f, forward)) != 0) return status;
-    if ((status = slide(q, qd, tau, w, sample, -1.0, 0.0, gain, &e, &f, backward)) != 0) return status;
+    double one[NQ], minus[NQ], way[NQ];
+    for (int i = 0; i < NQ; ++i) one[i] = 1.0, minus[i] = -1.0, way[i] = qd[i] < 0.0 ? -1.0 : 1.0;
+    if ((status = slide(q, qd, tau, w, sample, way, NUDGE, gain, &e, &f, faster)) != 0) return status;
+    if ((status = slide(q, qd, tau, w, sample, one, 0.0, gain, &e, &f, forward)) != 0) return status;
+    if ((status = slide(q, qd, tau, w, sample, minus, 0.0, gain, &e, &f, backward)) != 0) return status;
     for (int k = 0; k < COMPONENTS; ++k)
       if (STICKS[k]) f.mean[k] = 0.0;
     for (int i = 0; i < NQ; ++i) {
-      limit[i] = 0.5 * (backward[i] - forward[i]), damping[i] = fmax((forward[i] - faster[i]) / NUDGE, 0.0);
+      limit[i] = 0.5 * (backward[i] - forward[i]);
+      damping[i] = fmax(way[i] * ((way[i] < 0.0 ? backward[i] : forward[i]) - faster[i]) / NUDGE, 0.0);
       force[i] += 0.5 * (forward[i] + backward[i]) - MEAN_TERMS[2] * e.Q_D[i];
       force[i] += fmax(-limit[i], 0.0) * tanh(qd[i] / SMOOTH), limit[i] = fmax(limit[i], 0.0);
     }
