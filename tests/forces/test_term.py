@@ -172,7 +172,7 @@ class Cell(JointTerm):
 
 
 def test_a_law_that_a_notebook_defines_again_is_saved(tmp_path: Path) -> None:
-    """Its name is that of a prior of the library, and one of its columns that of a column of a library law."""
+    """Its name is that of a prior of the library, and the name of a column that of a library column."""
     system, data = log(7, 300)
     exec(CELL, globals())
     model = forcegp.StructuredGP(system, "analytical", [globals()["Cell"]()]).fit(data)

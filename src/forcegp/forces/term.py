@@ -30,6 +30,8 @@ SPEEDS = (0.02, 0.1, 0.5)
 SHARPEST = SPEEDS[0]
 FORCE = ("N m", "N")
 """Units of forces of revolute and of sliding joints."""
+Units = Mapping[str, tuple[str, str]]
+"""Units for revolute and for sliding joints, by names."""
 
 
 def exp(x: Array) -> Array:
@@ -154,7 +156,7 @@ class JointTerm(PerJointPrior):
     sticks = True
     laws: ClassVar[dict[str, type[JointTerm]]] = {}
     """All terms, by the names under which they are saved."""
-    units: ClassVar[Mapping[str, tuple[str, str]]] = {}
+    units: ClassVar[Units] = {}
     """Units of the weights of columns, for revolute and for sliding joints, by the first letters of the names
     of the columns. Other weights are in N m or N per unit of their column."""
 

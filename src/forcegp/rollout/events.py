@@ -151,8 +151,8 @@ def contact_loss_probability(
 ) -> Tensor:
     """Return the probability `(*batch, n_contacts)` that each contact opens at states `(*batch, nq)`.
 
-    P(λ < 0) = Φ(−μ/σ) for the posterior N(μ, σ²) of its normal multiplier, 1 for an open contact. `active` is a
-    mask `(*batch, n_contacts)` of closed contacts. By default, all contacts are closed.
+    P(λ < 0) = Φ(−μ/σ) for the posterior N(μ, σ²) of its normal multiplier, 1 for an open contact. `active` is
+    a mask `(*batch, n_contacts)` of closed contacts. By default, all contacts are closed.
 
     Raises:
         ModelError: the model does not predict the variance of the multiplier.

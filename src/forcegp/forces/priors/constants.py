@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -16,7 +17,7 @@ from forcegp.errors import ModelError
 from forcegp.forces.priors.base import JOINT, ForcePrior
 from forcegp.forces.priors.joint import OFFSET, ConstantForcePrior
 from forcegp.forces.quantities import States
-from forcegp.forces.term import FORCE, Array, JointState, JointTerm, constants
+from forcegp.forces.term import FORCE, Array, JointState, JointTerm, Units, constants
 from forcegp.gp.kernels import Columns, Constant, Kernel
 from forcegp.robot.model import RobotModel
 
@@ -106,7 +107,7 @@ class OffsetPrior(JointTerm):
 
     sticks = False
     scaled = False
-    units = {"offset": FORCE}
+    units: ClassVar[Units] = {"offset": FORCE}
 
     def columns(self, x: JointState) -> dict[str, Array]:
         every, zero = np.array(self.separable, dtype=float), x.qd * 0.0

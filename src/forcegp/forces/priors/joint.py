@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -20,7 +21,7 @@ from forcegp.dynamics import damping_force
 from forcegp.errors import ModelError, check_name
 from forcegp.forces.priors.base import JOINT, ForcePrior, check_inputs
 from forcegp.forces.quantities import States
-from forcegp.forces.term import FORCE, SPEEDS, Array, JointState, JointTerm, PerJointPrior
+from forcegp.forces.term import FORCE, SPEEDS, Array, JointState, JointTerm, PerJointPrior, Units
 from forcegp.gp.kernels import Kernel, Linear, SquaredExponential
 
 TERMS = ("bias", "gravity", "friction", "actuation")
@@ -160,7 +161,12 @@ class JointFrictionPrior(JointTerm):
     name: str = "joint_friction"
     target: str = JOINT
 
-    units = {"velocity": ("N m s/rad", "N s/m"), "load": ("1", "1"), "coulomb_": FORCE, "offset": FORCE}
+    units: ClassVar[Units] = {
+        "velocity": ("N m s/rad", "N s/m"),
+        "load": ("1", "1"),
+        "coulomb_": FORCE,
+        "offset": FORCE,
+    }
 
     def __post_init__(self) -> None:
         if not self.speeds or not all(0.0 < v < float("inf") for v in self.speeds):

@@ -13,12 +13,13 @@ a = e^{−s/δ}, and z̃ = z − (1 − a) E[z | q̇].
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import ClassVar
 
 import torch
 from torch import Tensor
 
 from forcegp.data.fields import in_time
-from forcegp.forces.term import FORCE, SPEEDS, Array, JointState, JointTerm, constants
+from forcegp.forces.term import FORCE, SPEEDS, Array, JointState, JointTerm, Units, constants
 from forcegp.gp.kernels import Columns, Kernel
 
 DISTANCES = (0.003, 0.01, 0.03, 0.1)
@@ -52,7 +53,7 @@ class BristlePrior(JointTerm):
     expected: tuple[tuple[tuple[float, ...], ...], ...] = ()
 
     remembers = True
-    units = {"z_": FORCE}
+    units: ClassVar[Units] = {"z_": FORCE}
 
     def columns(self, x: JointState) -> dict[str, Array]:
         count = len(DISTANCES)

@@ -10,12 +10,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 import torch
 from torch import Tensor
 from torch.nn.functional import max_pool1d
 
-from forcegp.forces.term import FORCE, Array, JointState, JointTerm, constants, cos, sin
+from forcegp.forces.term import FORCE, Array, JointState, JointTerm, Units, constants, cos, sin
 from forcegp.gp.kernels import Columns, Kernel
 
 MOST_WAVES = 4
@@ -54,7 +55,7 @@ class RipplePrior(JointTerm):
     kernel: Kernel = field(default_factory=Columns)
     name: str = "ripple"
 
-    units = {"sin_": FORCE, "cos_": FORCE}
+    units: ClassVar[Units] = {"sin_": FORCE, "cos_": FORCE}
 
     def columns(self, x: JointState) -> dict[str, Array]:
         columns = {}
