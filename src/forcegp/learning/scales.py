@@ -288,7 +288,10 @@ def residuals(problem: Problem, values: Mapping[str, Tensor], weights: Tensor, i
     if m.quantity == "qdd" and system.m:
         # 1 − Ã⁺Ã with Ã = A σ
         A = at.eom.A * std[:, None]
-        N = torch.eye(A.shape[-1]).to(A) - torch.linalg.pinv(A, rtol=1e-9) @ A
+        square = A.square().sum((1, 2), keepdim=True)
+        single = A.mT / torch.where(square > 0.0, square, 1.0)
+        inverse = single if system.m == 1 else torch.linalg.pinv(A, rtol=1e-9)
+        N = torch.eye(A.shape[-1]).to(A) - inverse @ A
         r, B = (N @ r[..., None])[..., 0], N @ B
     r = r if weight is None else weight[i].sqrt()[:, None] * r
     slow = torch.exp(-((m.qd / values[STICK_SPEED].exp()) ** 2))
