@@ -478,7 +478,7 @@ def lost_by_inducing(posterior: ForcePosterior) -> tuple[dict[str, Any], tuple[s
     warnings = (
         f"more inducing points would help: {diagnostics.size} basis functions leave a residual variance of "
         f"{diagnostics.missed:.3g}, compared with {diagnostics.learned:.3g} that the data determine; "
-        "raise inducing_points",
+        "raise inducing_points of Inference",
     )
     return {
         "inference": "sparse",

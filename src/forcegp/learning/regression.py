@@ -99,7 +99,7 @@ class Regression:
     worth: Mapping[str, float]
 
 
-def with_expectations(problem: Problem, standardize: bool = True) -> Problem:
+def with_expectations(problem: Problem) -> Problem:
     """Return the problem whose bristles know their mean at a velocity, from its training data."""
     changed = {}
     for prior in problem.priors:
@@ -112,7 +112,7 @@ def with_expectations(problem: Problem, standardize: bool = True) -> Problem:
         return problem
     priors = tuple(changed.get(prior.name, prior) for prior in problem.priors)
     kept = {p.name: s for p, s in zip(priors, problem.training.scales, strict=True) if p.name not in changed}
-    training = scaled(problem.training, problem.system, priors, kept, standardize)
+    training = scaled(problem.training, problem.system, priors, kept)
     return dataclasses.replace(problem, priors=priors, training=training)
 
 
