@@ -12,7 +12,8 @@ from torch import Tensor
 import forcegp
 from forcegp import dynamics, kinematics
 from forcegp.cli.common import warn_beyond
-from forcegp.forces.posterior import GROWTH, RELATIVE, STICKING, distance_beyond, trained_region
+from forcegp.forces.posterior import GROWTH, RELATIVE, distance_beyond, trained_region
+from forcegp.forces.term import NEAR_REST
 from forcegp.models.structured_fit import StructuredFit
 
 LEG = """<robot name="leg">
@@ -46,7 +47,7 @@ def test_distance_from_the_trained_region() -> None:
     torque = torch.tensor([[11.0, 0.0], [-5.0, 0.0], [10.0, 0.0]], dtype=torch.float64)
     found = distance_beyond(region, at, torque)
     speed, load = (2.0 - 0.98) * math.sqrt(3.0), (15.0 - 1.96) * math.sqrt(3.0) / 2.0
-    expected = torch.tensor([[0.0, 0.0], [math.hypot(speed, load), 0.0], [0.0, 0.2 / STICKING]]).double()
+    expected = torch.tensor([[0.0, 0.0], [math.hypot(speed, load), 0.0], [0.0, 0.2 / NEAR_REST]]).double()
     torch.testing.assert_close(found, expected, rtol=2e-3, atol=0.0)
     assert not distance_beyond({}, at, torque).any()
 

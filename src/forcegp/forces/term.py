@@ -25,9 +25,10 @@ from forcegp.robot.model import RobotModel
 
 Array = Any
 """A tensor `(n, nq)`, or a NumPy array `(nq,)` of scalars in a program."""
-SPEEDS = (0.02, 0.1, 0.5)
+NEAR_REST = 0.02
+"""Speed below which a joint or contact is nearly at rest [rad/s, m/s], the resolution of common encoders."""
+SPEEDS = (NEAR_REST, 0.1, 0.5)
 """Saturation speeds of dry friction [rad/s, m/s]: a sharp step and two more gradual transitions."""
-SHARPEST = SPEEDS[0]
 
 
 def exp(x: Array) -> Array:
@@ -84,9 +85,9 @@ class JointState:
     history: Sequence[Array] | None = None
     recording: Tensor | None = None
 
-    def direction(self, speed: float = SHARPEST) -> Array:
+    def direction(self, speed: float = NEAR_REST) -> Array:
         """Return the direction of motion, tanh(q̇/v) for a saturation speed v [rad/s, m/s]."""
-        return tanh(self.qd / speed) if self.slip is None or speed > SHARPEST else self.slip
+        return tanh(self.qd / speed) if self.slip is None or speed > NEAR_REST else self.slip
 
 
 class PerJointPrior(ForcePrior):

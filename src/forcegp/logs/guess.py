@@ -19,7 +19,7 @@ from forcegp.constraints import ConstrainedSystem, SurfaceContact
 from forcegp.data.derivative import cross_validated_window
 from forcegp.data.fields import MOST_RADIANS
 from forcegp.errors import DataError
-from forcegp.forces.term import SHARPEST
+from forcegp.forces.term import NEAR_REST
 from forcegp.guards import foreign
 from forcegp.logs import units
 from forcegp.logs.base import add_imu
@@ -298,7 +298,7 @@ def _remainder(draft: Draft, trial: Signals, correlation: Array) -> None:
     qd, tau = trial.vectors["qd"][:, own], trial.vectors["tau"][:, own]
     work, explained = np.zeros(qd.shape[1]), np.zeros(qd.shape[1])
     for i in range(qd.shape[1]):
-        columns = np.column_stack([np.ones(len(qd)), qd[:, i], np.tanh(qd[:, i] / SHARPEST)])
+        columns = np.column_stack([np.ones(len(qd)), qd[:, i], np.tanh(qd[:, i] / NEAR_REST)])
         weights = np.linalg.lstsq(columns, tau[:, i], rcond=None)[0]
         friction = columns[:, 1:] @ weights[1:]
         work[i] = float((friction * qd[:, i]).sum())
