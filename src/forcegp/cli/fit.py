@@ -105,7 +105,7 @@ def fit(
 
 CLEAR = 2.0
 """Number of standard deviations from zero beyond which a parameter is listed."""
-MOST = 3
+LISTED = 3
 """Maximum number of values in a list. The others are counted."""
 GROUPS = ("torque scale", "torque delay", "torque offset", "drive inertia", "link", "payload")
 """First words of the parameters of joints and links that are listed together."""
@@ -172,7 +172,7 @@ def _summary(
     groups = {group: [p for p in others if p.name.startswith(group)] for group in names}
     short = learned.system.robot.joint_names
     short = dict(zip(short, _short(short), strict=True))
-    listed = {group: _listed(found, short) for group, found in groups.items() if found}
+    listed = {group: _listed(members, short) for group, members in groups.items() if members}
     known = [text for text, _ in listed.values() if text]
     none = [group for group, (text, rest) in listed.items() if not text and rest != ALL]
     known += [f"none beyond {CLEAR:g}σ: {', '.join(none)}"] if none else []
@@ -325,8 +325,8 @@ def _listed(parameters: Sequence[RobotParameter], short: Mapping[str, str]) -> t
 
 def _first(texts: Sequence[str]) -> str:
     """Return the first texts, and the number of the others."""
-    more = [f"{len(texts) - MOST} more"] if len(texts) > MOST else []
-    return ", ".join([*texts[:MOST], *more])
+    more = [f"{len(texts) - LISTED} more"] if len(texts) > LISTED else []
+    return ", ".join([*texts[:LISTED], *more])
 
 
 def _training(

@@ -199,14 +199,14 @@ class ExpectedForce:
     @classmethod
     def of(cls, priors: Sequence[ForcePrior], tensors: Mapping[str, Tensor]) -> ExpectedForce:
         """Return the force of the terms among priors whose weights are among learned tensors."""
-        found = []
+        terms = []
         for prior in priors:
             start = f"{EXPECTED}.{prior.name}."
             keys = sorted(key for key in tensors if key.startswith(start))
             weights = {key.removeprefix(start): tensors[key] for key in keys}
             if isinstance(prior, JointTerm) and weights:
-                found.append((prior, weights))
-        return cls(tuple(found))
+                terms.append((prior, weights))
+        return cls(tuple(terms))
 
     def __call__(self, system: ConstrainedSystem, at: States) -> Tensor:
         """Return Q̂ `(n, nq)` at given states."""

@@ -302,9 +302,9 @@ def expected_forces(scales: Scales) -> Tensors:
 
     The basis functions are the columns times a constant for each joint, V = φ g.
     """
-    problem, basis, found = scales.problem, basis_of(scales.problem, scales.values), {}
+    problem, basis, expected = scales.problem, basis_of(scales.problem, scales.values), {}
     if not problem.has_coulomb:
-        return found
+        return expected
     process, system = problem.process_at(scales.values), problem.system
     at = problem.training.measurements[0].at(system)
     for p, prior in enumerate(problem.priors):
@@ -317,8 +317,8 @@ def expected_forces(scales: Scales) -> Tensors:
         for c, (name, phi) in zip(range(V.shape[-1]), columns.items(), strict=False):
             x = phi[..., 0].mT
             g = (V[..., c] * x).sum(1) / x.square().sum(1).clamp(min=1e-300)
-            found[f"{EXPECTED}.{prior.name}.{name}"] = g * w[:, c]
-    return found
+            expected[f"{EXPECTED}.{prior.name}.{name}"] = g * w[:, c]
+    return expected
 
 
 def worth_of(scales: Scales) -> dict[str, float]:
