@@ -148,7 +148,10 @@ def test_options_of_the_caller_override_the_table(made) -> None:
     [
         ('name = "sgp-meen"', r"model\.toml:2: model\.name: unknown model 'sgp-meen'(.|\n)*'sgp-mean'"),
         ('prior = "joint"', r"model\.toml:2: model\.prior: unknown key(.|\n)*did you mean 'priors'"),
-        ('inference = "magic"', r"model\.toml:2: model\.inference(.|\n)*exact(.|\n)*'magic'"),
+        (
+            'inference = "magic"',
+            r"model\.toml:2: model\.inference: input should be 'auto', 'exact'(.|\n)*'magic'",
+        ),
         ("inference = { points = 9 }", r"model\.toml:2: model\.inference(.|\n)*points(.|\n)*inducing_points"),
         ("inference.inducing_points = 0", r"model\.toml:2: model\.inference\.inducing_points: invalid"),
         ('name = "nn"\nmean = "zero"', r"model\.toml:3: model\.mean: not a setting of the model 'nn'"),

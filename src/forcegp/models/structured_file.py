@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import re
 from collections.abc import Mapping
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import torch
 from pydantic import Field, NonNegativeFloat, PositiveFloat, field_serializer
@@ -108,7 +108,7 @@ class StructuredSettings(Record):
     """Saved settings of a structured Gaussian process."""
 
     inference: Inference
-    inertia: Literal["file", "auto"] | None
+    inertia: Annotated[str, Field(pattern="^(file|auto)$")] | None
     mean: tuple[str, ...]
     noise: NoiseSettings
     power: float = Field(gt=0.0, le=1.0)

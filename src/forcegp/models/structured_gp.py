@@ -109,7 +109,7 @@ class StructuredGP(Model[StructuredFit]):
             stated if automatic else stated.for_priors(priors),
             analytical_parameters,
             automatic,
-            inference if isinstance(inference, Inference) else Inference(inference),
+            inference if isinstance(inference, Inference) else Inference(inference),  # pyright: ignore
             inertia,
         )
 
