@@ -194,8 +194,7 @@ def models() -> dict[str, StructuredFit]:
         "analytical",
         [JointFrictionPrior(), rough],
         noise=0.1,
-        inference="sparse",
-        inducing_points=POINTS,
+        inference=forcegp.models.Inference("sparse", inducing_points=POINTS),
     )
     fits["residual"] = model.fit(few, learn=[])
     return fits

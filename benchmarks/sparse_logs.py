@@ -14,6 +14,7 @@ from sparse_rows import median_ms
 
 from forcegp.data import Dataset, complement, split_by_stretches
 from forcegp.evaluation import evaluate
+from forcegp.models import Inference
 from forcegp.models.registry import create
 from forcegp.models.structured_fit import StructuredFit
 from forcegp.models.structured_gp import StructuredGP
@@ -101,8 +102,7 @@ def _sparse(train: Dataset, points: int = 100) -> StructuredFit:
         load_scene("kuka_plane").system(),
         "analytical",
         noise=NOISE,
-        inference="sparse",
-        inducing_points=points,
+        inference=Inference("sparse", inducing_points=points),
     )
     return model.fit(few[::5]).condition(few)
 

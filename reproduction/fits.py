@@ -169,8 +169,8 @@ def exact_model(name: str, task: Task) -> Model:
     if name == "gp":
         return IndependentGP(task.system, task.noise_std, standardize=False)
     mean = {"sgp-zero": "zero", "sgp-mean": "analytical"}[name]
-    priors = [JointForcePrior(PAPER)]
-    return StructuredGP(task.system, mean, priors, task.noise_std, inference="exact", standardize=False)
+    priors = [JointForcePrior(PAPER, scaled=False)]
+    return StructuredGP(task.system, mean, priors, task.noise_std, inference="exact")
 
 
 def reset_peak() -> bool:

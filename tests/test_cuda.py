@@ -50,10 +50,8 @@ def agree(found: Callable[[str], Any], tolerance: float = SAME) -> None:
 @cache
 def fitted(device: str, inference: str = "exact", learn: bool = False) -> StructuredFit:
     """Two contacts, joint and contact priors."""
-    settings: dict[str, Any] = {"inference": inference}
-    if inference == "sparse":
-        settings["inducing_points"] = 8
-    model = forcegp.StructuredGP(on(two_contacts(), device), "analytical", all_priors(), **settings)
+    chosen = forcegp.models.Inference(inference, inducing_points=8)
+    model = forcegp.StructuredGP(on(two_contacts(), device), "analytical", all_priors(), inference=chosen)
     data = logged(two_contacts(), ROWS).to(device)
     return model.fit(data, options=FEW) if learn else model.fit(data, learn=[])
 

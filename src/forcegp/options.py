@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Mapping
-from typing import Annotated, Any, Literal, TypeVar
+from dataclasses import dataclass
+from typing import Annotated, Literal
 
-from pydantic import Field, PositiveInt, ValidationError
+from pydantic import Field
 
-from forcegp.errors import ModelError, UnknownNameError
+from forcegp.errors import ModelError, check_name
 from forcegp.files import Record
 from forcegp.gp.inducing import LIMIT
 
 Width = Annotated[float, Field(ge=0.0, strict=True)]
-O = TypeVar("O", bound="KernelOptions")
 
 
 class Window(Record):
@@ -31,48 +29,29 @@ class Window(Record):
     angle: Width = 0.1
 
 
-class KernelOptions(Record):
-    """Options of models with kernels that depend on the state.
+@dataclass(frozen=True)
+class Inference:
+    """Inference about the forces of a `StructuredGP`.
 
-    Attributes:
-        standardize: whether to standardize kernel inputs, which the paper does not do.
+    Args:
+        method: `"exact"`, `"sparse"`, or `"auto"`, which depends on the priors and the number of samples.
+        inducing_points: maximum number of inducing points per prior. Fewer points are used if they suffice.
+            The result of the fit indicates whether more points would help.
+
+    Example:
+        >>> Inference("sparse", inducing_points=50).method
+        'sparse'
+
+    Raises:
+        UnknownNameError: the method does not exist.
+        ModelError: the number of points is not a positive integer.
     """
 
-    standardize: bool = True
+    method: Literal["auto", "exact", "sparse"] = "auto"
+    inducing_points: int = LIMIT
 
-    @classmethod
-    def of(cls: type[O], values: Mapping[str, Any]) -> O:
-        """Return the options in a mapping, after checking their types.
-
-        Raises:
-            UnknownNameError: a value is not one of the names allowed for its field.
-            ModelError: a value is invalid.
-        """
-        known = {name: values[name] for name in cls.model_fields if name in values}
-        try:
-            return cls.model_validate(known, strict=True)
-        except ValidationError as cause:
-            first = cause.errors()[0]
-            name = str(first["loc"][0])
-            if first["type"] == "literal_error":
-                names = re.findall(r"'([^']*)'", first["msg"])
-                raise UnknownNameError(name, values[name], names) from cause
-            raise ModelError(f"invalid `{name}`", expected=first["msg"], got=values[name]) from cause
-
-
-class StructuredOptions(KernelOptions):
-    """Options of `StructuredGP` with plain values.
-
-    Each field is also a constructor argument, a key of `[model]` and a setting of saved models. The fields
-    are repeated only in the constructor signature.
-
-    Attributes:
-        inference: the type of inference. `"auto"` chooses it according to the number of samples.
-        inducing_points: maximum number of inducing points per prior.
-        inertia: `"file"`, or `"auto"` to identify the inertia if the log supports it. `None` means `"auto"`
-            if priors are selected automatically, and `"file"` otherwise.
-    """
-
-    inference: Literal["auto", "exact", "sparse"] = "auto"
-    inducing_points: PositiveInt = LIMIT
-    inertia: Literal["file", "auto"] | None = None
+    def __post_init__(self) -> None:
+        check_name("inference", self.method, ("auto", "exact", "sparse"))
+        points = self.inducing_points
+        if isinstance(points, bool) or not isinstance(points, int) or points < 1:
+            raise ModelError("invalid `inducing_points`", expected="an integer greater than 0", got=points)

@@ -262,15 +262,23 @@ def test_fit_prints_what_an_engineer_reads_and_the_rest_on_request(tmp_path: Pat
     text = run(*arguments, "--out", tmp_path / "text")
     for internal in ("jitter", "objective", "evidence", "nats", "force_correlation"):
         assert internal not in text and internal not in text.replace(" ", "_")
-    assert len(text.splitlines()) <= len(joints) + 8
-    table = {line.split()[0]: line for line in text.splitlines()}
+    assert len(text.splitlines()) <= 10
+    assert "held-out torque error" in text and "open loop: off by" in text and "undetermined" in text
     found = json.loads(run(*arguments, "--out", tmp_path / "json", "--json"))
     assert found["jitter"] == 0.0 and found["seconds"] > 0.0
+    shown = {joint: list[str]() for joint in joints}
     for name, joint in ((name, joint) for name in ("slow friction", "fast friction") for joint in joints):
         (one,) = (p for p in found["robot_parameters"] if (p["name"], p["of"]) == (name, joint))
         assert abs(one["value"] - 0.5 - 0.1 * one["speed"]) < 4.0 * one["std"] + 0.02
-        assert f"{rounded(one['value'], one['std'])} at {one['speed']:.2g}" in table[joint]
+        std = max(
+            p["std"] for p in found["robot_parameters"] if p["of"] == joint and p["name"].endswith("friction")
+        )
+        shown[joint].append(rounded(one["value"], std).split(" ± ")[0])
+    for words in shown.values():
+        assert " ".join(words) in " ".join(text.split())
     verbose = run(*arguments, "--out", tmp_path / "verbose", "--verbose")
+    for one in (p for p in found["robot_parameters"] if p["name"].endswith("friction")):
+        assert f"{rounded(one['value'], one['std'])} at {one['speed']:.2g}" in verbose
     assert "jitter" in verbose and f"joint_friction of {joints[0]}" in verbose
 
 
@@ -278,6 +286,8 @@ def test_a_friction_that_only_a_prior_states_is_not_printed() -> None:
     """Standard deviations that are those of the prior, in the table and in the lists."""
     known = RobotParameter("drive inertia", "a", 0.3, 0.04, "kg m²", True)
     unknown = RobotParameter("drive inertia", "b", 0.4, 0.2, "kg m²", False)
-    assert _listed([known, unknown]) == "a 0.30 ± 0.04 kg m²; not determined: b"
-    assert _listed([unknown]) == "not determined"
-    assert _listed([RobotParameter("link mass·x", "a", 0.01, 0.01, "kg m", True)]) == "no change beyond 2σ"
+    assert _listed([known, unknown], {"a": "joint 1"}) == ("drive inertia [kg m²] joint 1 0.30 ± 0.04", "b")
+    assert _listed([unknown], {}) == ("", "all")
+    assert _listed([RobotParameter("link mass·x", "a", 0.01, 0.01, "kg m", True)], {}) == ("", "")
+    many = [RobotParameter("torque offset", str(k), 1.0 + k, 0.1, "N m", True) for k in range(6)]
+    assert _listed(many, {})[0] == "torque offset [N m] 5 6.00 ± 0.10, 4 5.00 ± 0.10, 3 4.00 ± 0.10, 3 more"

@@ -19,10 +19,8 @@ MAXIMUM_LIKELIHOOD = LearningOptions("adam", max_evaluations=5, warm_start=None,
 
 
 def model() -> forcegp.StructuredGP:
-    priors = [forcegp.priors.JointForcePrior()]
-    return forcegp.StructuredGP(
-        two_contacts(), "analytical", priors, 0.1, inference="exact", standardize=False
-    )
+    priors = [forcegp.priors.JointForcePrior(scaled=False)]
+    return forcegp.StructuredGP(two_contacts(), "analytical", priors, 0.1, inference="exact")
 
 
 def test_inputs_enter_in_their_units() -> None:

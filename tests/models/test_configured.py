@@ -21,7 +21,7 @@ from forcegp.forces.priors.memory import BristlePrior
 from forcegp.gp import kernels
 from forcegp.gp.kernels import Linear, Matern52, SquaredExponential, Sum
 from forcegp.learning.specification import WITH_PARAMETERS
-from forcegp.models import LearningOptions
+from forcegp.models import Inference, LearningOptions
 from forcegp.models.analytical import ADAM, AnalyticalModel, Window
 from forcegp.models.configured import Configured, configured, keys_of
 from forcegp.models.independent_gp import IndependentGP
@@ -80,7 +80,7 @@ contact = "table"
     assert spec.priors == (JointForcePrior(kernel, ("q", "qd")), ContactForcePrior("table"))
     assert spec.mean == AnalyticalMean(("gravity", "actuation"))
     assert spec.noise == Noise((0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7), True, 0.5, (1e-3, 1e-2))
-    assert spec.options.inference == "exact"
+    assert spec.inference.method == "exact"
 
 
 def test_robot_parameters_and_learning_of_a_structured_gp(made) -> None:
@@ -102,18 +102,21 @@ learning = { optimizer = "adam", restarts = 3, warm_start = false }
 def test_noise_with_tails_and_terms(made) -> None:
     found = made("""
 noise = { degrees_of_freedom = 4.0 }
-standardize = false
+inference = { method = "sparse", inducing_points = 7 }
 [[model.priors]]
 type = "joint_friction"
 speeds = [0.05]
+[[model.priors]]
+type = "joint"
+scaled = false
 [[model.priors]]
 type = "bristles"
 [model.learning]
 hyperpriors = false
 """)
     spec = found.model.specification
-    assert (spec.noise.degrees_of_freedom, spec.options.standardize) == (4.0, False)
-    assert spec.priors == (JointFrictionPrior(speeds=(0.05,)), BristlePrior())
+    assert (spec.noise.degrees_of_freedom, spec.inference) == (4.0, Inference("sparse", inducing_points=7))
+    assert spec.priors == (JointFrictionPrior(speeds=(0.05,)), JointForcePrior(scaled=False), BristlePrior())
     assert found.options == LearningOptions(hyperpriors=False)
 
 
@@ -145,7 +148,12 @@ def test_options_of_the_caller_override_the_table(made) -> None:
     [
         ('name = "sgp-meen"', r"model\.toml:2: model\.name: unknown model 'sgp-meen'(.|\n)*'sgp-mean'"),
         ('prior = "joint"', r"model\.toml:2: model\.prior: unknown key(.|\n)*did you mean 'priors'"),
-        ('inference = "magic"', r"model\.toml:2: model\.inference(.|\n)*'exact'(.|\n)*'magic'"),
+        (
+            'inference = "magic"',
+            r"model\.toml:2: model\.inference: input should be 'auto', 'exact'(.|\n)*'magic'",
+        ),
+        ("inference = { points = 9 }", r"model\.toml:2: model\.inference(.|\n)*points(.|\n)*inducing_points"),
+        ("inference.inducing_points = 0", r"model\.toml:2: model\.inference\.inducing_points: invalid"),
         ('name = "nn"\nmean = "zero"', r"model\.toml:3: model\.mean: not a setting of the model 'nn'"),
         (
             'name = "gp"\n[model.learning]\nepochs = 3',

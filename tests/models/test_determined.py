@@ -19,6 +19,7 @@ from forcegp.data import RobotMismatchWarning
 from forcegp.errors import ModelError, NumericalError
 from forcegp.evaluation.predicted import multiplier_scores
 from forcegp.forces.priors.sets import contact_priors, friction_priors
+from forcegp.models import Inference
 from forcegp.models.prediction import Prediction
 from forcegp.models.structured_fit import StructuredFit
 from forcegp.simulate import simulate
@@ -178,13 +179,12 @@ def test_options_without_effect_are_said(data: forcegp.Dataset) -> None:
     joint = [forcegp.priors.JointForcePrior()]
     assert 'inertia="auto" has no effect' in doubts_of(data, force_priors=joint, inertia="auto")
     exact = {"force_priors": joint, "inference": "exact"}
-    assert "inducing_points=50 has no effect: the fit has exact" in doubts_of(
-        data, inducing_points=50, **exact
-    )
+    many = {"force_priors": joint, "inference": Inference("exact", inducing_points=50)}
+    assert "inducing_points=50 has no effect: the fit has exact" in doubts_of(data, **many)
     friction = [forcegp.priors.JointFrictionPrior()]
-    finite = {"force_priors": friction, "inference": "sparse", "inducing_points": 50}
+    finite = {"force_priors": friction, "inference": Inference("sparse", inducing_points=50)}
     assert "priors with finitely many features" in doubts_of(data, **finite)
-    used = {"force_priors": joint, "inference": "sparse", "inducing_points": 20}
+    used = {"force_priors": joint, "inference": Inference("sparse", inducing_points=20)}
     for settings in (exact, used, {"force_priors": friction_priors(SYSTEM), "inertia": "auto"}):
         assert "no effect" not in doubts_of(data, **settings)
 

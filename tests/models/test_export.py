@@ -102,7 +102,8 @@ def one_contact() -> StructuredFit:
 def sparse() -> StructuredFit:
     """Inducing points of a residual force, in two contacts."""
     priors = friction_and_residual()
-    model = forcegp.StructuredGP(two_contacts(), "analytical", priors, inference="sparse", inducing_points=12)
+    sparse = forcegp.models.Inference("sparse", inducing_points=12)
+    model = forcegp.StructuredGP(two_contacts(), "analytical", priors, inference=sparse)
     return model.fit(logged(two_contacts(), 80), learn=[])
 
 
@@ -116,9 +117,8 @@ def zero_mean() -> StructuredFit:
     """The whole force: products of linear and stationary kernels, sines of angles."""
     priors = (JointForcePrior(WHOLE, periodic=True), *default_priors(two_contacts(), "zero")[1:])
     priors = (priors[0], NormalForcePrior(priors[0]))
-    model = forcegp.StructuredGP(
-        two_contacts(), "zero", priors, noise=0.1, inference="sparse", inducing_points=12
-    )
+    sparse = forcegp.models.Inference("sparse", inducing_points=12)
+    model = forcegp.StructuredGP(two_contacts(), "zero", priors, noise=0.1, inference=sparse)
     return model.fit(logged(two_contacts(), 50), learn=[])
 
 

@@ -111,7 +111,7 @@ def test_truncated_files_are_refused(saved: Callable[[str], Path], tmp_path: Pat
     ("name", "place", "value", "message"),
     [
         ("gp", "version", 99, "version 99"),
-        ("gp", "version", 3, r"expected: version 4\s+got: version 3"),
+        ("gp", "version", 4, r"expected: version 5\s+got: version 4"),
         ("gp", "format", "pickle", "a different format"),
         ("gp", "kind", "oracle", "kind of models.*'oracle'"),
         ("gp", "settings.noise_std", "loud", "'settings.noise_std"),

@@ -1,4 +1,4 @@
-"""One table of options: the constructor, the table `[model]` of scenes and saved files agree with it."""
+"""Options of models: refusal of wrong values, agreement of the constructor with the table `[model]`."""
 
 from __future__ import annotations
 
@@ -7,56 +7,57 @@ from typing import Any
 
 import pytest
 
+import forcegp
 from forcegp.errors import ModelError, UnknownNameError
 from forcegp.forces.priors.joint import AnalyticalMean
-from forcegp.models.independent_gp import IndependentGP, IndependentSettings
-from forcegp.models.structured_file import StructuredSettings
+from forcegp.models import Inference
+from forcegp.models.independent_gp import IndependentGP
 from forcegp.models.structured_gp import StructuredGP
-from forcegp.options import KernelOptions, StructuredOptions
 from forcegp.scene.sections import ModelSection
 from random_data import table_system
 
 SYSTEM = table_system()
 
 
+def test_the_table_has_the_defaults_of_the_constructors() -> None:
+    arguments = inspect.signature(StructuredGP).parameters
+    section = ModelSection()
+    assert section.inference == Inference(arguments["inference"].default)
+    assert section.inertia == arguments["inertia"].default
+    assert section.standardize == inspect.signature(IndependentGP).parameters["standardize"].default
+
+
 @pytest.mark.parametrize(
-    ("made", "table", "saved"),
+    ("made", "options", "kind", "match"),
     [
-        (StructuredGP, StructuredOptions, StructuredSettings),
-        (IndependentGP, KernelOptions, IndependentSettings),
+        (StructuredGP, {"inference": "sparce"}, UnknownNameError, r"inference 'sparce'[\s\S]*'sparse'"),
+        (StructuredGP, {"inertia": "fle"}, UnknownNameError, r"unknown inertia 'fle'[\s\S]*'file'"),
+        (IndependentGP, {"standardize": "no"}, ModelError, r"invalid `standardize`[\s\S]*got: no"),
     ],
 )
-def test_every_place_has_the_options_with_their_defaults(
-    made: type, table: type[KernelOptions], saved: type[KernelOptions]
+def test_a_wrong_option_is_refused_by_name(
+    made: type, options: dict[str, Any], kind: type, match: str
 ) -> None:
-    arguments = inspect.signature(made).parameters
-    for name, field in table.model_fields.items():
-        assert arguments[name].default == field.default
-        for other in (saved, ModelSection):
-            own = other.model_fields[name]
-            assert (own.default, own.annotation) == (field.default, field.annotation)
-
-
-@pytest.mark.parametrize(
-    ("options", "kind", "match"),
-    [
-        ({"inference": "sparce"}, UnknownNameError, r"unknown inference 'sparce'[\s\S]*'sparse'"),
-        ({"inertia": "fle"}, UnknownNameError, r"unknown inertia 'fle'[\s\S]*'file'"),
-        ({"inducing_points": 0}, ModelError, r"invalid `inducing_points`[\s\S]*greater than 0"),
-        ({"inducing_points": True}, ModelError, r"invalid `inducing_points`[\s\S]*integer"),
-        ({"standardize": "no"}, ModelError, r"invalid `standardize`[\s\S]*boolean"),
-    ],
-)
-def test_a_wrong_option_is_refused_by_name(options: dict[str, Any], kind: type, match: str) -> None:
     with pytest.raises(kind, match=match):
-        StructuredOptions.of(options)
+        made(SYSTEM, **options)
+
+
+@pytest.mark.parametrize("points", [0, True, 2.5])
+def test_a_wrong_number_of_points_is_refused(points: Any) -> None:
+    with pytest.raises(ModelError, match=r"invalid `inducing_points`[\s\S]*greater than 0"):
+        Inference("sparse", inducing_points=points)
 
 
 def test_options_are_kept_for_the_fit() -> None:
-    spec = StructuredGP(
-        SYSTEM, "zero", inference="sparse", inducing_points=7, standardize=False
-    ).specification
-    assert spec.options == StructuredOptions(inference="sparse", inducing_points=7, standardize=False)
+    inference = Inference("sparse", inducing_points=7)
+    assert StructuredGP(SYSTEM, "zero", inference=inference).specification.inference is inference
+
+
+def test_inputs_in_their_units_are_also_those_along_the_normal() -> None:
+    """The normal force shares the hyperparameters of the joint force, so also the units of its inputs."""
+    joint = forcegp.priors.JointForcePrior(scaled=False)
+    assert forcegp.priors.NormalForcePrior(joint).scaled is False
+    assert forcegp.priors.NormalForcePrior(forcegp.priors.JointForcePrior()).scaled is True
 
 
 def test_the_mean_is_analytical_unless_another_is_named() -> None:

@@ -53,6 +53,12 @@ def with_prior(make: Callable[[], Any]) -> Callable[[Settings], Settings]:
     return lambda s: s | {"force_priors": [*s["force_priors"], make()]}
 
 
+def in_units(s: Settings) -> Settings:
+    return s | {
+        "force_priors": [dataclasses.replace(s["force_priors"][0], scaled=False), *s["force_priors"][1:]]
+    }
+
+
 def theta() -> AnalyticalParameters:
     return AnalyticalParameters(log()[0].robot, {"mass": "all"})
 
@@ -68,8 +74,8 @@ OPTIONS: dict[str, Callable[[Settings], Settings]] = {
     "joint friction": with_prior(forcegp.priors.JointFrictionPrior),
     "inertial prior": with_prior(InertialPrior),
     "analytical parameters": lambda s: s | {"analytical_parameters": theta()},
-    "sparse": lambda s: s | {"inference": "sparse", "inducing_points": 6},
-    "units": lambda s: s | {"standardize": False},
+    "sparse": lambda s: s | {"inference": forcegp.models.Inference("sparse", inducing_points=6)},
+    "units": in_units,
 }
 REPLACE = {frozenset(("stated torque noise", "learned torque noise"))}
 """Two values of one option."""

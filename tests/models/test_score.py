@@ -66,4 +66,4 @@ def test_a_saved_model_knows_where_its_inertia_is_from(inertia: str, tmp_path: P
     model = forcegp.StructuredGP(two_contacts(), "zero", noise=0.1, inertia=inertia)
     model.fit(logged(two_contacts(), 12), learn=[]).save(tmp_path / "model")
     loaded = forcegp.load_model(tmp_path / "model")
-    assert isinstance(loaded, StructuredFit) and loaded.specification.options.inertia == inertia
+    assert isinstance(loaded, StructuredFit) and loaded.specification.inertia == inertia

@@ -64,8 +64,8 @@ def test_as_in_memory(files: StreamedDataset) -> None:
 
 
 def test_inducing_points(files: StreamedDataset) -> None:
-    priors, points = friction_and_residual(), {"inference": "sparse", "inducing_points": 12}
-    small = forcegp.StructuredGP(two_contacts(), "analytical", priors, 0.1, **points)
+    priors, sparse = friction_and_residual(), forcegp.models.Inference("sparse", inducing_points=12)
+    small = forcegp.StructuredGP(two_contacts(), "analytical", priors, 0.1, inference=sparse)
     fit = small.fit(files, learn=[])
     assert_same(fit, small.fit(data, learn=[]), SAME)
     assert isinstance(fit.posterior.latent, SparsePosterior)

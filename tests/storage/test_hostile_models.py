@@ -37,7 +37,11 @@ def saved(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
     root, found = tmp_path_factory.mktemp("models"), {}
     sparse = forcegp.StructuredGP(
-        SYSTEM, "analytical", friction_priors(SYSTEM), 0.1, inference="sparse", inducing_points=6
+        SYSTEM,
+        "analytical",
+        friction_priors(SYSTEM),
+        0.1,
+        inference=forcegp.models.Inference("sparse", inducing_points=6),
     )
     sparse.fit(random_data(SYSTEM, 40), options=LearningOptions(max_evaluations=1)).save(root / "sparse")
     found["sparse"] = model_path(root / "sparse")

@@ -34,7 +34,7 @@ MATERIAL, MATERIAL_EACH = 0.15, 0.05
 
 DISCRETE = ("torque-sign", "joint-sign", "torque-order", "joint-order")
 """Hypotheses that are not mistaken for friction."""
-AT_REST = 0.5
+MAY_STICK = 0.5
 """Speed below which a joint may stick, relative to the speed at which dry friction has risen. With .2, .5
 and 1, no wrong masses are reported in two logs of a UR5 with correct masses. Without it, they are in both."""
 
@@ -237,7 +237,7 @@ def _while_moving(model: Explanation, hypothesis: Hypothesis) -> bool:
     """
     log, rows = model.log, model.rows
     shapes = hypotheses.shape_columns(model.system, log, rows)[..., : None if len(model.prior) else 0]
-    moving = np.abs(log.qd[rows]) > AT_REST * model.system.robot.friction_velocity.numpy()
+    moving = np.abs(log.qd[rows]) > MAY_STICK * model.system.robot.friction_velocity.numpy()
     moving |= moving.mean() <= 0.5
 
     def at(changed: Log) -> Explanation:

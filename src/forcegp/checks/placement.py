@@ -57,8 +57,8 @@ def check_placement(system: ConstrainedSystem, log: Log) -> Outcome:
             both, where = tuple(log.joint_names[j] for j in pair), f"{1e3 * np.median(c):+.3g}"
             where = f"{where} ± {1e3 * robust_std(c):.2g} mm from the surface of {contact.name!r}"
             text = f"the tip is {where}, and on it if {' and '.join(both)} are exchanged"
-            found = log.finding("joint-order", text, both)
-            return [found], log.changed(("q", "qd", "qdd", "tau"), order=pair)
+            finding = log.finding("joint-order", text, both)
+            return [finding], log.changed(("q", "qd", "qdd", "tau"), order=pair)
         if len(c) and level_of(c, TOUCHING, LEVEL) is None:
             rows = evenly(np.flatnonzero(moves), TRIED_ROWS)
             if (outcome := _never_closed(system, contact, log, rows)) is not None:
@@ -74,8 +74,8 @@ def _on_surface(contact: SurfaceContact, log: Log, path: Path) -> Finding | None
     rows = log.usable & (np.abs(path.c - level) <= TOUCHING)
     text = f"contact {contact.name!r} is never closed, but the tip lies on its surface in "
     text += f"{100 * rows.sum() / log.usable.sum():.0f} % of the rows:"
-    found = at_rows(rows, "contact-missed", text, rows=rows.sum())[0]
-    return replace(found, contact=contact.name, weight="error")
+    finding = at_rows(rows, "contact-missed", text, rows=rows.sum())[0]
+    return replace(finding, contact=contact.name, weight="error")
 
 
 def _never_closed(

@@ -53,11 +53,16 @@ def say(text: object, label: str = "", indent: int = 2, err: bool = False, **sty
     """Print a text after a styled label, wrapped at the width of the terminal, but not in files and pipes."""
     lines = printable(f"{label}{text}").splitlines()
     if (sys.stderr if err else sys.stdout).isatty() and not isinstance(text, Verbatim):
-        width, whole = max(shutil.get_terminal_size().columns, 2 * indent), dict.fromkeys(WHOLE, False)
+        width, whole = max(terminal_width(), 2 * indent), dict.fromkeys(WHOLE, False)
         lines = [textwrap.fill(line, width, subsequent_indent=" " * indent, **whole) for line in lines]
     printed = "\n".join(lines)
     typer.secho(printed[: len(label)], nl=False, err=err, reset=bool(style), **style)
     typer.echo(printed[len(label) :], err=err)
+
+
+def terminal_width() -> int:
+    """Return the number of columns of the terminal, or 80 without one."""
+    return shutil.get_terminal_size().columns
 
 
 def warn(text: object) -> None:
@@ -111,15 +116,15 @@ def named(name: str) -> str:
     return name.replace("_", " ")
 
 
-def rounded(value: float, std: float | None = None) -> str:
+def rounded(value: float, std: float | None = None, digits: int = 2) -> str:
     """Return a value with its standard deviation, rounded to one or two digits of the latter, if known.
 
-    >>> rounded(4.2496, 0.0374), rounded(123.4, 21.0), rounded(0.012)
-    ('4.25 ± 0.04', '123 ± 21', '0.012')
+    >>> rounded(4.2496, 0.0374), rounded(123.4, 21.0), rounded(0.012), rounded(3.212, 0.024, digits=1)
+    ('4.25 ± 0.04', '123 ± 21', '0.012', '3.21 ± 0.02')
     """
     if std is None or not (math.isfinite(std) and std > 0.0):
         return f"{value:.3g}"
-    places = max(0, 1 - math.floor(math.log10(std / 0.355)))
+    places = max(0, 1 - math.floor(math.log10(std / (0.355 if digits == 2 else 0.1))))
     return f"{value:.{places}f} ± {std:.{places}f}"
 
 

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import asdict
+from itertools import takewhile
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -12,7 +13,7 @@ from typer import Option
 
 import forcegp
 from forcegp.cli import common, options
-from forcegp.cli.common import progress_bar, rounded, say, show, show_table
+from forcegp.cli.common import Verbatim, progress_bar, rounded, say, show, show_table, terminal_width
 from forcegp.errors import ParameterError
 
 if TYPE_CHECKING:
@@ -95,21 +96,30 @@ def fit(
         common.warn(doubt)
     if as_json:
         summary = {"model": regression.name, "training_points": len(training), **_complete(learned)}
+        summary["file"] = str(model_path(out))
     else:
-        summary = _summary(learned, regression.name, len(training))
-        summary |= _details(learned.result) if verbose else {}
-    show({**summary, "file": str(model_path(out))}, as_json)
+        summary = _summary(learned, regression.name, training, model_path(out))
+        summary |= _details(learned) if verbose else {}
+    show(summary, as_json)
 
 
 CLEAR = 2.0
 """Number of standard deviations from zero beyond which a parameter is listed."""
+LISTED = 3
+"""Maximum number of values in a list. The others are counted."""
 GROUPS = ("torque scale", "torque delay", "torque offset", "drive inertia", "link", "payload")
-"""First words of the parameters that are listed together."""
+"""First words of the parameters of joints and links that are listed together."""
 FRICTION = ("slow friction", "fast friction")
 UNITS = {"revolute": "friction and noise in N m at speeds in rad/s", "prismatic": "N at m/s if sliding"}
 """Units of the table of friction, by type of joint."""
 NOT = "–"
 """Mark of friction that the log does not determine."""
+ALL = "all"
+"""Mark of a group that the log does not determine at all."""
+FORCE_SAMPLES = 300
+"""Maximum number of training samples whose normal force is predicted."""
+OPEN_LOOP = 0.3
+"""Time after which the motion in open loop is printed [s]."""
 
 
 def _complete(learned: FittedModel) -> dict[str, object]:
@@ -127,76 +137,196 @@ def _numbers(result: FitResult) -> dict[str, object]:
     return {name: value for name, value in asdict(result).items() if name != "history"}
 
 
-def _details(result: FitResult) -> dict[str, object]:
-    """Return the numbers of the computation as lines, without the warnings, which are printed before."""
-    worth = "".join(f"\n  {name}: {nats:.3g} nats" for name, nats in result.worth.items())
-    return {**_numbers(result), "worth": worth, "warnings": None}
-
-
-def _summary(learned: FittedModel, name: str, rows: int) -> dict[str, object]:
-    """Print the friction of each joint, and return the other parameters, the noise and the duration."""
+def _details(learned: FittedModel) -> dict[str, object]:
+    """Print the joints, and return the numbers of the computation, without the warnings, printed before."""
     from forcegp.models.structured_fit import StructuredFit
     from forcegp.plots import unit
 
-    result = learned.result
-    part = "" if result.samples in (None, rows) else f"{result.samples} rows in motion, of "
-    lines: dict[str, object] = {"model": f"{name}, learned from {part}{rows} rows in {result.seconds:.2g} s"}
+    noise: dict[str, object] = {}
     if isinstance(learned, StructuredFit):
-        parameters = learned.robot_parameters()
-        _show_joints(learned, parameters)
-        groups = {group: [p for p in parameters if p.name.startswith(group)] for group in GROUPS}
-        others = [p for p in parameters if not p.name.startswith((*GROUPS, *FRICTION))]
-        for contact in learned.system.contact_names:
-            groups[f"contact {contact}"] = [p for p in others if p.of == contact]
-        lines |= {group: _listed(listed) for group, listed in groups.items() if listed}
-        if not parameters:
-            lines["forces"] = ", ".join(prior.name for prior in learned.force_priors)
+        _show_joints(learned)
         kinds = learned.system.robot.joint_types
-        for quantity, std in learned.noise.items():
-            size = float(std.mean())
-            lines[f"noise of {quantity}"] = f"{size:.3g} {unit(quantity, kinds)}" if size > 0.0 else None
+        sizes = {quantity: float(std.mean()) for quantity, std in learned.noise.items()}
+        noise = {f"noise of {name}": f"{x:.3g} {unit(name, kinds)}" for name, x in sizes.items() if x > 0.0}
+    worth = "".join(f"\n  {name}: {nats:.3g} nats" for name, nats in learned.result.worth.items())
+    return {**noise, **_numbers(learned.result), "worth": worth, "warnings": None}
+
+
+def _summary(
+    learned: FittedModel, name: str, data: forcegp.Dataset | forcegp.StreamedDataset, out: Path
+) -> dict[str, object]:
+    """Print the friction of each joint, and return what else was learned, its accuracy, and what was not."""
+    from forcegp.models.structured_fit import StructuredFit
+
+    result, rows = learned.result, len(data)
+    part = "" if result.samples in (None, rows) else f"{result.samples} of "
+    lines: dict[str, object] = {
+        "model": f"{out}: {name}, learned from {part}{rows} rows in {result.seconds:.2g} s"
+    }
+    if not isinstance(learned, StructuredFit):
+        return lines
+    parameters = learned.robot_parameters()
+    _show_friction(learned, parameters)
+    others = [p for p in parameters if p.name not in FRICTION]
+    names = dict.fromkeys((*GROUPS, *(p.name for p in others if not p.name.startswith(GROUPS))))
+    groups = {group: [p for p in others if p.name.startswith(group)] for group in names}
+    short = learned.system.robot.joint_names
+    short = dict(zip(short, _short(short), strict=True))
+    listed = {group: _listed(members, short) for group, members in groups.items() if members}
+    known = [text for text, _ in listed.values() if text]
+    none = [group for group, (text, rest) in listed.items() if not text and rest != ALL]
+    known += [f"none beyond {CLEAR:g}σ: {', '.join(none)}"] if none else []
+    missing = [group if rest == ALL else f"{group} of {rest}" for group, (_, rest) in listed.items() if rest]
+    lines["learned"] = "; ".join(known)
+    if not parameters:
+        lines["learned"] = f"forces {', '.join(prior.name for prior in learned.force_priors)}"
+    lines["accuracy"] = "; ".join(_accuracy(learned, data))
+    lines["undetermined"] = "; ".join(missing)
     return lines
 
 
-def _show_joints(learned: StructuredFit, parameters: Sequence[RobotParameter]) -> None:
-    """Print a table of the friction and the torque noise of each joint."""
-    import torch
-
+def _show_friction(learned: StructuredFit, parameters: Sequence[RobotParameter]) -> None:
+    """Print the friction of each joint, and its torque error relative to its torque, in several columns."""
     friction = {(p.of, p.name): p for p in parameters if p.name in FRICTION}
     if not friction:
         return
-    robot, noise, rows = learned.system.robot, learned.torque_std, [["joint", *FRICTION, "torque noise"]]
+    robot, shares = learned.system.robot, _torque_errors(learned)
+    driven = [j for j in range(robot.nq) if bool(robot.driven[j])]
+    cells = []
+    for j, name in zip(driven, _short([robot.joint_names[j] for j in driven]), strict=True):
+        pair = [friction.get((robot.joint_names[j], word)) for word in FRICTION]
+        std = max((p.std for p in pair if p and p.determined and p.std), default=None)
+        each = [rounded(p.value, std).split(" ± ") if p and p.determined else [NOT] for p in pair]
+        spread = next((f"±{value[1]}" for value in each if len(value) > 1), "")
+        error = "" if shares is None else f"{shares[j]:.0%}"
+        cells.append([name, *(value[0] for value in each), spread, error])
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    texts = [
+        f"{name:<{widths[0]}} " + " ".join(f"{x:>{w}}" for x, w in zip(values, widths[1:], strict=True))
+        for name, *values in cells
+    ]
+    across = max(1, (terminal_width() + 3) // (len(texts[0]) + 3))
+    down = -(-len(texts) // across)
+    units = ["N m" if robot.joint_types[j] == "revolute" else "N" for j in driven]
+    source = "held-out" if learned.specification.noise.learns_torque else "stated"
+    error = "" if shares is None else f"; {source} torque error [% of torque σ]"
+    missing = f"; {NOT}: undetermined" * any(NOT in cell for cell in cells)
+    say(f"friction [{', '.join(dict.fromkeys(units))}], slow and fast motion, ±σ{error}{missing}")
+    for k in range(down):
+        say(Verbatim("   ".join(texts[k::down]).rstrip()))
+
+
+def _torque_errors(learned: StructuredFit) -> list[float] | None:
+    """Return the torque noise of each joint relative to the standard deviation of its torque, if known."""
+    import torch
+
+    if learned.torque_std is None or not learned.training.samples:
+        return None
     tau = torch.cat([m.tau for m in learned.training.measurements])
+    return (learned.torque_std / tau.std(0).clamp(min=1e-12)).tolist()
+
+
+def _short(names: Sequence[str]) -> list[str]:
+    """Return names without their common first and last words, if they remain distinct.
+
+    >>> _short(["shoulder_pan_joint", "elbow_joint"]), _short(["arm_joint_1", "arm_joint_2"]), _short(["a_1"])
+    (['shoulder_pan', 'elbow'], ['joint 1', 'joint 2'], ['a_1'])
+    """
+    words = [name.split("_") for name in names]
+    first, last = (
+        sum(1 for _ in takewhile(lambda each: len(set(each)) == 1, zip(*part, strict=False)))
+        for part in (words, [each[::-1] for each in words])
+    )
+    short = ["_".join(each[first : len(each) - last]) for each in words]
+    if not all(short) or len(set(short)) < len(names):
+        return list(names)
+    return [f"joint {each}" if each.isdigit() else each for each in short]
+
+
+def _accuracy(learned: StructuredFit, data: forcegp.Dataset | forcegp.StreamedDataset) -> Iterator[str]:
+    """Yield the errors in open loop on the training motion, and the standard deviation of normal forces."""
+    from forcegp.evaluation import open_loop
+
+    motion = (
+        None if isinstance(data, forcegp.StreamedDataset) else open_loop(learned, learned.specified, data)
+    )
+    if motion is not None and OPEN_LOOP in motion.horizons:
+        k = motion.horizons.index(OPEN_LOOP)
+        model, file = (_share(shares[k]) for shares in (motion.model, motion.robot_file))
+        yield f"open loop: off by {model} of the training motion after {OPEN_LOOP:g} s (robot file: {file})"
+    stds = list(_force_std(learned))
+    if stds:
+        low, high = (f"{x:.2g}" for x in (min(stds), max(stds)))
+        yield f"normal force ± {low if low == high else f'{low} to {high}'} N (σ)"
+
+
+def _share(share: float | None) -> str:
+    return "over 100%" if share is None or share > 1.0 else f"{share:.0%}"
+
+
+def _force_std(learned: StructuredFit) -> Iterator[float]:
+    """Yield the mean standard deviation of each normal force in training samples in contact [N]."""
+    import torch
+
+    if not learned.system.contacts or not learned.training.samples:
+        return
+    parts = learned.training.evenly(FORCE_SAMPLES).measurements
+    q, qd, tau, active = (torch.cat([getattr(m, x) for m in parts]) for x in ("q", "qd", "tau", "active"))
+    noise = learned.torque_std is not None
+    force = learned.predict(q, qd, tau, "multiplier", active=active, noise=noise)
+    for k, contact in enumerate(learned.system.contacts):
+        closed, rows = active[:, k], learned.system.rows[contact.name]
+        if isinstance(contact, forcegp.SurfaceContact) and bool(closed.any()) and force.std is not None:
+            yield float(force.std[closed][:, rows].mean())
+
+
+def _show_joints(learned: StructuredFit) -> None:
+    """Print a table of the friction, with its speeds, and of the torque noise of each joint."""
+    friction = {(p.of, p.name): p for p in learned.robot_parameters() if p.name in FRICTION}
+    if not friction:
+        return
+    robot, noise, rows = learned.system.robot, learned.torque_std, [["joint", *FRICTION, "torque noise"]]
     for j, joint in enumerate(robot.joint_names):
         if not bool(robot.driven[j]):
             continue
         each = (friction.get((joint, name)) for name in FRICTION)
         cells = [f"{rounded(p.value, p.std)} at {p.speed:.2g}" if p and p.determined else NOT for p in each]
-        size = "" if noise is None else f"{float(noise[j]):.2g}"
-        share = f" ({float(noise[j] / tau[:, j].std()):.0%})" if noise is not None and tau[:, j].any() else ""
-        rows.append([joint, *cells, f"{size}{share}"])
+        rows.append([joint, *cells, "" if noise is None else f"{float(noise[j]):.2g}"])
     show_table(rows)
-    units = ", ".join(dict.fromkeys(UNITS[kind] for kind in robot.joint_types))
-    missing = f"; {NOT}: not determined" * any(NOT in row for row in rows)
-    say(f"{units}; ± is one σ; (%) of the torque's σ{missing}")
+    say(f"{', '.join(dict.fromkeys(UNITS[kind] for kind in robot.joint_types))}; ± is one σ")
 
 
-def _listed(parameters: Sequence[RobotParameter]) -> str:
-    """Return the parameters that are clear, and the names of those that the log does not determine."""
+def _listed(parameters: Sequence[RobotParameter], short: Mapping[str, str]) -> tuple[str, str]:
+    """Return the clear parameters of a group, and the names of those that the log does not determine.
+
+    Args:
+        parameters: parameters of a group.
+        short: short names of the joints.
+    """
 
     def label(p: RobotParameter) -> str:
         word = p.name.removeprefix("link ").removeprefix("payload ")
-        return f"{p.of} {word}" if word != p.name else p.of if p.name in GROUPS else p.name
+        return " ".join(x for x in (short.get(p.of, p.of), word if word != p.name else "") if x)
 
     known = [p for p in parameters if p.determined and abs(p.value) > CLEAR * (p.std or 0.0)]
-    texts = [f"{label(p)} {rounded(p.value, p.std)} {p.unit}".strip() for p in known]
-    links = parameters[0].name.startswith("link ")
+    known.sort(key=lambda p: -abs(p.value) / (p.std or abs(p.value)))
+    group = next((name for name in GROUPS if parameters[0].name.startswith(name)), parameters[0].name)
+    units = {p.unit for p in known}
+    (unit,) = units if len(units) == 1 else ("",)
+    texts = [f"{label(p)} {rounded(p.value, p.std)} {'' if unit else p.unit}".strip() for p in known]
+    links = group == "link"
     # Most parameters of single links are never determined.
     missing = [label(p) for p in parameters if not p.determined and not links]
-    if len(missing) == len(parameters):
-        return "not determined"
-    text = ", ".join(texts) or f"no{' change' if links else 'ne'} beyond {CLEAR:g}σ"
-    return f"{text}; not determined: {', '.join(missing)}" if missing else text
+    heading = f"{group} [{unit}] " if unit else f"{group} "
+    return heading * bool(texts) + _first(texts), ALL if missing and len(missing) == len(
+        parameters
+    ) else _first(missing)
+
+
+def _first(texts: Sequence[str]) -> str:
+    """Return the first texts, and the number of the others."""
+    more = [f"{len(texts) - LISTED} more"] if len(texts) > LISTED else []
+    return ", ".join([*texts[:LISTED], *more])
 
 
 def _training(

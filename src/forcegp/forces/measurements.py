@@ -521,14 +521,12 @@ def training_of(
     priors: Sequence[ForcePrior],
     noise_std: NoiseStd | None,
     kept: Mapping[str, Standardization],
-    standardize: bool = True,
 ) -> Training:
     """Return the measurements with their noise and input scales.
 
     Args:
         noise_std: standard deviation of accelerations that do not specify their noise.
         kept: existing scales to keep, keyed by prior name.
-        standardize: whether to standardize kernel inputs.
 
     Raises:
         ModelError, DataError: there are no data, or they do not match the system.
@@ -548,7 +546,7 @@ def training_of(
         filter_span=max(o.data.header.filter_span or 0.0 for o in observations),
         filter_variance=max(o.data.header.filter_variance for o in observations),
     )
-    return scaled(training, system, priors, kept, standardize)
+    return scaled(training, system, priors, kept)
 
 
 def with_history(m: Measurement, data: Dataset, system: ConstrainedSystem) -> Measurement:
@@ -567,7 +565,6 @@ def scaled(
     system: ConstrainedSystem,
     priors: Sequence[ForcePrior],
     kept: Mapping[str, Standardization],
-    standardize: bool = True,
 ) -> Training:
     """Return the training data with input scales for given priors; see `training_of` for the arguments."""
     new = [prior for prior in priors if prior.name not in kept]
@@ -576,7 +573,7 @@ def scaled(
     for prior, features in [(prior, [prior.features(system, a) for a in at]) for prior in new]:
         together = {k: torch.cat([f[k] for f in features]) for k in features[0]}
         scale = Standardization.of(together, prior.vectors, prior.centred)
-        scales[prior.name] = scale if standardize and prior.scaled else Standardization.none(together)
+        scales[prior.name] = scale if prior.scaled else Standardization.none(together)
     return dataclasses.replace(training, scales=tuple(scales[prior.name] for prior in priors))
 
 

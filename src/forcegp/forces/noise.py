@@ -20,11 +20,11 @@ from torch import Tensor
 from forcegp.constraints import ConstrainedSystem
 from forcegp.errors import ModelError, UnknownNameError
 from forcegp.forces.measurements import Measurement, NoiseStd, Training
-from forcegp.forces.posterior import STICK_NOISE, STICK_SPEED, STICKING
+from forcegp.forces.posterior import STICK_NOISE, STICK_SPEED
 from forcegp.forces.priors.base import NOISE, ForcePrior
 from forcegp.forces.priors.inertial import InertialPrior
 from forcegp.forces.quantities import AffineMap, ForceField, States, linearize_field
-from forcegp.forces.term import JointTerm
+from forcegp.forces.term import NEAR_REST, JointTerm
 from forcegp.robot.model import RobotModel
 from forcegp.robust import MAD_TO_STD
 
@@ -120,7 +120,7 @@ def initial_torque_noise(residual: Tensor, driven: Tensor) -> dict[str, Tensor]:
     return {
         TORQUE_NOISE: std,
         STICK_NOISE: std.clone(),
-        STICK_SPEED: torch.full_like(std, math.log(STICKING)),
+        STICK_SPEED: torch.full_like(std, math.log(NEAR_REST)),
     }
 
 

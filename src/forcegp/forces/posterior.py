@@ -30,7 +30,7 @@ from forcegp.forces.measurements import Training
 from forcegp.forces.priors.base import CONSTRAINT, CONTACT, JOINT, NOISE, ForceMean, ForcePrior
 from forcegp.forces.priors.contact import CoulombFriction, coupled, with_coulomb
 from forcegp.forces.quantities import DOUBTS, AffineMap, States, affine_map, hidden_forces
-from forcegp.forces.term import JointTerm
+from forcegp.forces.term import NEAR_REST, JointTerm
 from forcegp.gp.draws import FunctionSamples
 from forcegp.gp.exact import ExactPosterior
 from forcegp.gp.features import Block, Standardization
@@ -40,8 +40,6 @@ STICK_NOISE, STICK_SPEED = f"{NOISE}.stick.log_noise_std", f"{NOISE}.stick.log_s
 """Names of the learned parameters σ_s and v_s of each joint."""
 MEMORY = f"{NOISE}.memory.log_std"
 """Name of the standard deviation `(nq,)` of friction with memory at a state without past [N m, N]."""
-STICKING = 0.02
-"""Initial value of v_s [rad/s, m/s]."""
 REGION = f"{NOISE}.region."
 LOW, HIGH, SPREAD, GROWTH = (REGION + name for name in ("low", "high", "spread", "growth"))
 """Names under which the trained region is stored: the lower limits, upper limits and standard deviations of

@@ -20,11 +20,11 @@ from forcegp.constraints import ConstrainedSystem
 from forcegp.errors import ModelError
 from forcegp.forces.measurements import Measurement, Training, scaled
 from forcegp.forces.noise import TORQUE_NOISE, ForceNoise, SampleNoise, state_jacobian
-from forcegp.forces.posterior import STICKING, ForcePosterior, ForceProcess, hidden_variance, trained_region
+from forcegp.forces.posterior import ForcePosterior, ForceProcess, hidden_variance, trained_region
 from forcegp.forces.priors.base import ANALYTICAL, NOISE, RESERVED, ForceMean, ForcePrior
 from forcegp.forces.priors.contact import CoulombErrorPrior, CoulombFriction, coulomb_of
 from forcegp.forces.projection import WhitenedRows, combine, whiten
-from forcegp.forces.term import ExpectedForce
+from forcegp.forces.term import NEAR_REST, ExpectedForce
 from forcegp.forces.unknowns import tip_factor
 from forcegp.gp.basis import LatentBasis, latent_basis
 from forcegp.gp.exact import ExactPosterior, require_exact_fits
@@ -163,7 +163,7 @@ class Problem:
         for m in self.training.measurements:
             points = m.at(system).eom.contact_points
             most = math.ceil(samples * len(m.q) / self.training.samples)
-            slides = [m.active[:, k] & (points[x].sliding[1].norm(dim=-1) > STICKING) for x, k in contacts]
+            slides = [m.active[:, k] & (points[x].sliding[1].norm(dim=-1) > NEAR_REST) for x, k in contacts]
             moving = _even(torch.stack(slides).any(0).nonzero()[:, 0], max(1, most // 2))
             others = _even(torch.arange(len(m.q), device=m.q.device), max(1, most - len(moving)))
             rows.append(torch.cat([moving, others]).unique())
@@ -478,7 +478,7 @@ def lost_by_inducing(posterior: ForcePosterior) -> tuple[dict[str, Any], tuple[s
     warnings = (
         f"more inducing points would help: {diagnostics.size} basis functions leave a residual variance of "
         f"{diagnostics.missed:.3g}, compared with {diagnostics.learned:.3g} that the data determine; "
-        "raise inducing_points",
+        "raise inducing_points of Inference",
     )
     return {
         "inference": "sparse",

@@ -25,9 +25,10 @@ from forcegp.robot.model import RobotModel
 
 Array = Any
 """A tensor `(n, nq)`, or a NumPy array `(nq,)` of scalars in a program."""
-SPEEDS = (0.02, 0.1, 0.5)
+NEAR_REST = 0.02
+"""Speed below which a joint or contact is nearly at rest [rad/s, m/s], the resolution of common encoders."""
+SPEEDS = (NEAR_REST, 0.1, 0.5)
 """Saturation speeds of dry friction [rad/s, m/s]: a sharp step and two more gradual transitions."""
-SHARPEST = SPEEDS[0]
 FORCE = ("N m", "N")
 """Units of forces of revolute and of sliding joints."""
 Units = Mapping[str, tuple[str, str]]
@@ -88,9 +89,9 @@ class JointState:
     history: Sequence[Array] | None = None
     recording: Tensor | None = None
 
-    def direction(self, speed: float = SHARPEST) -> Array:
+    def direction(self, speed: float = NEAR_REST) -> Array:
         """Return the direction of motion, tanh(q̇/v) for a saturation speed v [rad/s, m/s]."""
-        return tanh(self.qd / speed) if self.slip is None or speed > SHARPEST else self.slip
+        return tanh(self.qd / speed) if self.slip is None or speed > NEAR_REST else self.slip
 
 
 class PerJointPrior(ForcePrior):
@@ -228,14 +229,14 @@ class ExpectedForce:
     @classmethod
     def of(cls, priors: Sequence[ForcePrior], tensors: Mapping[str, Tensor]) -> ExpectedForce:
         """Return the force of the terms among priors whose weights are among learned tensors."""
-        found = []
+        terms = []
         for prior in priors:
             start = f"{EXPECTED}.{prior.name}."
             keys = sorted(key for key in tensors if key.startswith(start))
             weights = {key.removeprefix(start): tensors[key] for key in keys}
             if isinstance(prior, JointTerm) and weights:
-                found.append((prior, weights))
-        return cls(tuple(found))
+                terms.append((prior, weights))
+        return cls(tuple(terms))
 
     def __call__(self, system: ConstrainedSystem, at: States) -> Tensor:
         """Return Q̂ `(n, nq)` at given states."""

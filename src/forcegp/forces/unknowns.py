@@ -22,9 +22,10 @@ from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem, SurfaceContact
 from forcegp.forces.external_wrench import FORCE_STD
-from forcegp.forces.posterior import RELATIVE, STICKING
+from forcegp.forces.posterior import RELATIVE
 from forcegp.forces.priors.base import NOISE
 from forcegp.forces.quantities import States
+from forcegp.forces.term import NEAR_REST
 from forcegp.robust import MAD_TO_STD
 
 DETERMINED = 1e-6
@@ -68,7 +69,7 @@ def learned_tips(system: ConstrainedSystem, tensors: Mapping[str, Tensor]) -> li
 def share_at_rest(tensors: Mapping[str, Tensor], at: States, contact: str) -> Tensor:
     """Return k `(n,)`, which is 1 while a contact with a stated stick speed sticks."""
     point, speed = at.eom.contact_points[contact], tensors.get(tip_keys(contact).speed)
-    k = torch.exp(-point.sliding[1].square().sum(-1) / (STICKING if speed is None else speed.exp()) ** 2)
+    k = torch.exp(-point.sliding[1].square().sum(-1) / (NEAR_REST if speed is None else speed.exp()) ** 2)
     return k if point.sticks is None else k.masked_fill(point.sticks, 1.0)
 
 
@@ -85,7 +86,7 @@ def unknown_tip(tensors: Mapping[str, Tensor], contact: str) -> tuple[float, flo
     Unless the size is learned, σ = 0 and s is `FORCE_STD`.
     """
     keys = tip_keys(contact)
-    speed = float(tensors[keys.speed].exp()) if keys.speed in tensors else STICKING
+    speed = float(tensors[keys.speed].exp()) if keys.speed in tensors else NEAR_REST
     if keys.rests not in tensors:
         return 0.0, FORCE_STD**2, speed
     slides, rests = (float((2.0 * tensors[key]).exp()) for key in (keys.slides, keys.rests))
@@ -132,7 +133,7 @@ def stated_tips(system: ConstrainedSystem, states: Iterable[States]) -> dict[str
         if len(load) and bool((load > 0.0).any()):
             s = LARGEST_COEFFICIENT * float(load.square().mean().sqrt())
             speed = NORMAL_SPEED_STDS * MAD_TO_STD * float(torch.cat(normal[name]).abs().median())
-            stated = RELATIVE * s, s, max(STICKING, speed)
+            stated = RELATIVE * s, s, max(NEAR_REST, speed)
             values = (system.robot.mass.new_tensor(math.log(x)) for x in stated)
             tips |= dict(zip(tip_keys(name), values, strict=True))
     return tips

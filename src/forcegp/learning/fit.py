@@ -95,7 +95,7 @@ def learned(
         # 5. Correlation of the residuals
         part = _at_the_rate_of_the_log(part, values, neighbours or problem.training)
     training = dataclasses.replace(problem.training, scales=part.training.scales, slopes=part.training.slopes)
-    keeps = columns and spec.options.inference != "exact"
+    keeps = columns and spec.inference.method != "exact"
     whole = dataclasses.replace(part, training=training, inducing=part.inducing if keeps else None)
     whole = prepared(spec, whole, values)
     warnings = (*lesson.warnings, *_little_weight(spec, whole))
@@ -121,7 +121,7 @@ def _of_columns(
     if spec.noise.learn and NOISE in free:
         problem, noise = with_acceleration_noise(problem)
         start |= noise
-    problem = with_expectations(problem, spec.options.standardize)
+    problem = with_expectations(problem)
     degrees = spec.noise.degrees_of_freedom
     result = regression(problem, start, free.__contains__, spec.automatic, degrees, progress)
     values, seconds = dict(result.values), time.perf_counter() - began
@@ -150,7 +150,7 @@ def _of_kernels(
         part = dataclasses.replace(part, power=FIRST_POWER)
     outcome, learned_on = search.solve(part, report, begin), part.training.samples
     sloped = part.state_std is not None
-    sloped &= not is_sparse(spec.options.inference, part.priors, problem.training.all_samples)
+    sloped &= not is_sparse(spec.inference.method, part.priors, problem.training.all_samples)
     warnings: list[str] = []
     for number in range(RELEARNINGS):
         before = part
@@ -180,7 +180,7 @@ def _little_weight(spec: Specification, whole: Problem) -> tuple[str, ...]:
 def subset(spec: Specification, problem: Problem) -> Problem:
     """Return the problem restricted to the samples from which hyperparameters are learned."""
     training = problem.training
-    if not is_sparse(spec.options.inference, problem.priors, training.all_samples):
+    if not is_sparse(spec.inference.method, problem.priors, training.all_samples):
         return problem
     finite = is_finite(problem.priors)
     most = LEARN_SAMPLES if finite else LEARN_SAMPLES_INDUCING
@@ -207,13 +207,13 @@ def _at_the_rate_of_the_log(part: Problem, values: Mapping[str, Tensor], trainin
 def prepared(spec: Specification, problem: Problem, values: Mapping[str, Tensor]) -> Problem:
     """Return the problem with its inference method and, for heavy-tailed noise, its sample weights."""
     pointed = problem.inducing is not None and any(prior.remainder for prior in problem.priors)
-    if pointed or is_sparse(spec.options.inference, problem.priors, problem.training.all_samples):
+    if pointed or is_sparse(spec.inference.method, problem.priors, problem.training.all_samples):
         # Sums over samples use the slopes of the model in the robot file.
         problem = dataclasses.replace(problem, training=dataclasses.replace(problem.training, slopes=None))
         if is_finite(problem.priors):
             problem = without_inducing(problem)
         elif not pointed:
-            problem = with_inducing(problem, values, spec.options.inducing_points)
+            problem = with_inducing(problem, values, spec.inference.inducing_points)
     if spec.noise.degrees_of_freedom is None:
         return problem
     return weighted(problem, values, spec.noise.degrees_of_freedom)

@@ -99,7 +99,7 @@ class Regression:
     worth: Mapping[str, float]
 
 
-def with_expectations(problem: Problem, standardize: bool = True) -> Problem:
+def with_expectations(problem: Problem) -> Problem:
     """Return the problem whose bristles know their mean at a velocity, from its training data."""
     changed = {}
     for prior in problem.priors:
@@ -112,7 +112,7 @@ def with_expectations(problem: Problem, standardize: bool = True) -> Problem:
         return problem
     priors = tuple(changed.get(prior.name, prior) for prior in problem.priors)
     kept = {p.name: s for p, s in zip(priors, problem.training.scales, strict=True) if p.name not in changed}
-    training = scaled(problem.training, problem.system, priors, kept, standardize)
+    training = scaled(problem.training, problem.system, priors, kept)
     return dataclasses.replace(problem, priors=priors, training=training)
 
 
@@ -302,9 +302,9 @@ def expected_forces(scales: Scales) -> Tensors:
 
     The basis functions are the columns times a constant for each joint, V = φ g.
     """
-    problem, basis, found = scales.problem, basis_of(scales.problem, scales.values), {}
+    problem, basis, expected = scales.problem, basis_of(scales.problem, scales.values), {}
     if not problem.has_coulomb:
-        return found
+        return expected
     process, system = problem.process_at(scales.values), problem.system
     at = problem.training.measurements[0].at(system)
     for p, prior in enumerate(problem.priors):
@@ -317,8 +317,8 @@ def expected_forces(scales: Scales) -> Tensors:
         for c, (name, phi) in zip(range(V.shape[-1]), columns.items(), strict=False):
             x = phi[..., 0].mT
             g = (V[..., c] * x).sum(1) / x.square().sum(1).clamp(min=1e-300)
-            found[f"{EXPECTED}.{prior.name}.{name}"] = g * w[:, c]
-    return found
+            expected[f"{EXPECTED}.{prior.name}.{name}"] = g * w[:, c]
+    return expected
 
 
 def worth_of(scales: Scales) -> dict[str, float]:

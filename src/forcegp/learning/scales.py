@@ -33,6 +33,7 @@ from forcegp.forces.posterior import STICK_NOISE, STICK_SPEED, hidden_variance
 from forcegp.forces.priors.base import NOISE
 from forcegp.forces.problem import Problem, Tensors, basis_of, remainder
 from forcegp.forces.quantities import affine_map
+from forcegp.forces.term import NEAR_REST
 from forcegp.forces.unknowns import AXES, learned_tips, share_at_rest, tip_keys, tip_operator
 from forcegp.gp.sums import Sums, accumulate, without_feedback
 from forcegp.learning.correlation import autocorrelation_time
@@ -60,9 +61,9 @@ LEAST_VARIANCE = EXACT**2
 ROUNDING = 32.0
 """Added to the diagonal of covariances of rows, relative to it, in units of the machine epsilon ε: above the
 rounding of a factorization of 18 joints, about 18 ε."""
-AT_REST = (0.02, 0.05, 0.1)
+AT_REST = (NEAR_REST, 0.05, 0.1)
 """Speeds v_s below which a joint or contact is nearly at rest, of which the likeliest is taken [rad/s, m/s]:
-the resolution of common encoders, and speeds at which joints reverse within a sampling period."""
+`NEAR_REST`, and speeds at which joints reverse within a sampling period."""
 FEWEST_FOR_VARIANCE = 10.0
 """Number of samples below which a variance has its stated value. Of static friction, samples at rest count,
 and of the unknown force of a contact that slides, samples in contact. Those of contacts count κ times. If κ

@@ -40,7 +40,7 @@ from forcegp.gp.optimise import LearningOptions
 from forcegp.learning.inertia import Inertia, inertia_of
 from forcegp.learning.inverse_dynamics import LEAST, without_delay
 from forcegp.learning.search import Search, initial
-from forcegp.options import StructuredOptions
+from forcegp.options import Inference
 from forcegp.robot.model import RobotModel
 
 OPTIONS, WITH_PARAMETERS = LearningOptions(), LearningOptions(tolerance=1e-9)
@@ -64,7 +64,9 @@ class Specification:
         noise: the noise of measured accelerations, torques and states.
         analytical_parameters: a module with a `forward()` method that returns the robot at θ_A, or `None`.
         automatic: whether all terms that apply to the data take part.
-        options: options with plain values.
+        inference: the method of inference.
+        inertia: `"file"`, or `"auto"` to identify the inertia if the log supports it. `None` means `"auto"`
+            if all terms that apply take part, and `"file"` otherwise.
     """
 
     system: ConstrainedSystem
@@ -73,7 +75,8 @@ class Specification:
     noise: Noise
     analytical_parameters: nn.Module | None = None
     automatic: bool = False
-    options: StructuredOptions = field(default_factory=StructuredOptions)
+    inference: Inference = field(default_factory=Inference)
+    inertia: str | None = None
 
     def for_data(self, data: Dataset | Sequence[Observation], adds: bool = True) -> Specification:
         """Return the specification with the noise resolved for the given data.
@@ -107,11 +110,10 @@ class Specification:
         scale = max(o.data.header.torque_scale_std or 0.0 for o in observations)
         if scale and not any(isinstance(prior, DrivePrior) for prior in priors):
             priors = (*priors, DrivePrior(std=scale))
-        if self.options.inference != "exact" and not any(prior.remainder for prior in priors):
+        if self.inference.method != "exact" and not any(prior.remainder for prior in priors):
             priors = (*priors, ResidualPrior())
-        options = self.options.model_copy(update={"inertia": self.options.inertia or "auto"})
-        noise = self.noise.for_priors(priors)
-        return dataclasses.replace(self, priors=priors, noise=noise, options=options)
+        noise, inertia = self.noise.for_priors(priors), self.inertia or "auto"
+        return dataclasses.replace(self, priors=priors, noise=noise, inertia=inertia)
 
     def with_spread(self, spread: tuple[float, ...]) -> Specification:
         """Return the specification with the standard deviations of the scales of torques over the log."""
@@ -129,7 +131,7 @@ class Specification:
         """Return the inertia identified from the training samples if requested, or that of the robot file."""
         laws = [prior for prior in self.priors if isinstance(prior, JointFrictionPrior | OffsetPrior)]
         scale = next((prior.std for prior in self.priors if isinstance(prior, DrivePrior)), None)
-        links = self.options.inertia == "auto"
+        links = self.inertia == "auto"
         known = "actuation" in self.mean.terms and self.analytical_parameters is None
         asks = known and (links or (self.automatic and scale is not None))
         lacks = not any(isinstance(law, JointFrictionPrior) for law in laws)
@@ -263,13 +265,12 @@ def training_for(
     if before is not None and learned is not None:
         scales = zip(spec.priors, before.training.scales, strict=True)
         kept = {prior.name: scale for prior, scale in scales if prior.name not in learned}
-    noise_std, standardize = spec.noise.acceleration, spec.options.standardize
     observations, dropped, still = observations_of(data), 0, [False] * spec.system.robot.nq
     if spec.noise.learns_torque:
         observations, dropped = without_outliers(observations)
         still = still_of(spec, kept) if learned is not None else still_joints(observations)
         observations = [replace(o, data=at_rest(o.data, still)) for o in observations]
-    training = training_of(observations, spec.system, spec.priors, noise_std, kept, standardize)
+    training = training_of(observations, spec.system, spec.priors, spec.noise.acceleration, kept)
     if any(prior.delay for prior in spec.priors):
         training = without_delay(training, spec.priors)
     if spec.automatic:

@@ -163,7 +163,7 @@ def _check_inference(spec: Specification, count: int, held: int) -> None:
             got=f"{count:,}",
             hint="select rows, or omit degrees_of_freedom",
         )
-    if spec.options.inference == "exact" and count > held:
+    if spec.inference.method == "exact" and count > held:
         raise ModelError(
             f"exact inference on a log of {count:,} samples that is streamed",
             expected=f"at most {2 * SAMPLE_ROWS - 1:,} samples",

@@ -180,9 +180,9 @@ def merge_short(closed: NDArray[np.bool_], signals: Signals, shortest: float) ->
         bounds = np.concatenate([[0], np.flatnonzero(np.diff(state)) + 1, [len(state)]])
         while len(bounds) > 3:
             length = t[bounds[1:] - 1] - t[bounds[:-1]]
-            own, around = length[1:-1], length[:-2] + length[2:]
-            i = int(np.lexsort((-around, own))[0])
-            if own[i] >= shortest:
+            duration, around = length[1:-1], length[:-2] + length[2:]
+            i = int(np.lexsort((-around, duration))[0])
+            if duration[i] >= shortest:
                 break
             bounds, count = np.delete(bounds, [i + 1, i + 2]), count + 1
         for start, stop in pairwise(bounds):

@@ -19,7 +19,7 @@ from forcegp.constraints import ConstrainedSystem, SurfaceContact
 from forcegp.data.derivative import cross_validated_window
 from forcegp.data.fields import MOST_RADIANS
 from forcegp.errors import DataError
-from forcegp.forces.term import SHARPEST
+from forcegp.forces.term import NEAR_REST
 from forcegp.guards import foreign
 from forcegp.logs import units
 from forcegp.logs.base import add_imu
@@ -199,8 +199,8 @@ def _signals(path: str | Path, draft: Draft, system: ConstrainedSystem, without:
 def _velocity_unit(draft: Draft, trial: Signals) -> None:
     """Infer the unit and sign of the velocity from its slope against the derivative of the position."""
     family = draft.families["velocity"]
-    own = _own(draft, trial)
-    q, qd = trial.vectors["q"][:, own], trial.vectors["qd"][:, own]
+    articulated = _articulated(draft, trial)
+    q, qd = trial.vectors["q"][:, articulated], trial.vectors["qd"][:, articulated]
     inner = np.flatnonzero(trial.segment[2:] == trial.segment[:-2]) + 1
     rate = (q[inner + 1] - q[inner - 1]) / (trial.t[inner + 1] - trial.t[inner - 1])[:, None]
     slopes = (rate * qd[inner]).sum(axis=0) / np.maximum((rate**2).sum(axis=0), 1e-300)
@@ -222,7 +222,7 @@ def _velocity_unit(draft: Draft, trial: Signals) -> None:
     else:
         family.unit = unit
         draft.say("velocity", f"{unit}: {slope:.3g} times the derivative of the position in rad/s")
-    family.sign = _signs(slopes, moving, np.array(trial.joint_names)[own])
+    family.sign = _signs(slopes, moving, np.array(trial.joint_names)[articulated])
     if family.sign != 1.0:
         turned = "all joints" if family.sign == -1.0 else "some joints"
         draft.say("velocity", f"the velocity of {turned} is minus the derivative of the position", doubt=True)
@@ -240,7 +240,7 @@ def _time_unit(draft: Draft, slope: float) -> str | None:
     return best if best != unit and 1.0 / NEAR < off[best] < NEAR else None
 
 
-def _own(draft: Draft, trial: Signals) -> NDArray[np.bool_]:
+def _articulated(draft: Draft, trial: Signals) -> NDArray[np.bool_]:
     """Return the mask (nq,) of the joints with columns of their own, other than those of a free base."""
     return ~np.isin(trial.joint_names, BASE_JOINTS if "base" in draft.further else ())
 
@@ -257,9 +257,9 @@ def _signs(slopes: Array, clear: np.ndarray, joints: NDArray[np.str_]) -> float 
 
 def _torque(draft: Draft, trial: Signals, system: ConstrainedSystem) -> None:
     """Infer the sign and unit of the torque by comparing it with the inverse dynamics."""
-    family, own = draft.families["torque"], _own(draft, trial)
-    joints = np.array(trial.joint_names)[own]
-    slopes, correlation = (x[own] for x in torque_slopes(trial, system))
+    family, articulated = draft.families["torque"], _articulated(draft, trial)
+    joints = np.array(trial.joint_names)[articulated]
+    slopes, correlation = (x[articulated] for x in torque_slopes(trial, system))
     clear = np.abs(correlation) > 0.5
     listing = ", ".join(f"{j} {c:+.2f}" for j, c in zip(joints, correlation, strict=True))
     draft.say("torque", f"correlation with the robot's inverse dynamics: {listing}")
@@ -270,7 +270,7 @@ def _torque(draft: Draft, trial: Signals, system: ConstrainedSystem) -> None:
         draft.say("torque", text, doubt=True)
     measured = len(clear) - len(family.unmeasured)
     if (share := gravity_share(trial, system)) < LACKING:
-        lighter, follows = (x[own] for x in torque_slopes(trial, system, "gravity"))
+        lighter, follows = (x[articulated] for x in torque_slopes(trial, system, "gravity"))
         if (np.abs(follows) > 0.5).sum() >= min(clear.sum(), 0.5 * measured):
             slopes, clear, family.compensated = lighter, np.abs(follows) > 0.5, "gravity"
             text = (
@@ -294,11 +294,11 @@ def _torque(draft: Draft, trial: Signals, system: ConstrainedSystem) -> None:
 
 def _remainder(draft: Draft, trial: Signals, correlation: Array) -> None:
     """Propose `compensated = "model"` for torques that friction explains, and their sign: drives push."""
-    family, own = draft.families["torque"], _own(draft, trial)
-    qd, tau = trial.vectors["qd"][:, own], trial.vectors["tau"][:, own]
+    family, articulated = draft.families["torque"], _articulated(draft, trial)
+    qd, tau = trial.vectors["qd"][:, articulated], trial.vectors["tau"][:, articulated]
     work, explained = np.zeros(qd.shape[1]), np.zeros(qd.shape[1])
     for i in range(qd.shape[1]):
-        columns = np.column_stack([np.ones(len(qd)), qd[:, i], np.tanh(qd[:, i] / SHARPEST)])
+        columns = np.column_stack([np.ones(len(qd)), qd[:, i], np.tanh(qd[:, i] / NEAR_REST)])
         weights = np.linalg.lstsq(columns, tau[:, i], rcond=None)[0]
         friction = columns[:, 1:] @ weights[1:]
         work[i] = float((friction * qd[:, i]).sum())
@@ -307,7 +307,7 @@ def _remainder(draft: Draft, trial: Signals, correlation: Array) -> None:
     few = (explained > 0.5).sum() < 0.5 * (len(work) - len(family.unmeasured))
     if few or (correlation**2).mean() > UNRELATED:
         return draft.say("torque", "few torques follow the inverse dynamics: sign unknown", doubt=True)
-    family.sign = _signs(work, explained > 0.5, np.array(trial.joint_names)[own])
+    family.sign = _signs(work, explained > 0.5, np.array(trial.joint_names)[articulated])
     family.compensated = "model"
     draft.say("torque", "friction explains it: the driver seems to subtract a model", doubt=True)
 
@@ -326,8 +326,8 @@ def torque_slopes(
     slopes, correlation = np.zeros(system.robot.nq), np.zeros(system.robot.nq)
     for i, (tau, *rigid) in enumerate(_beside_friction(trial, system, names)):
         x = rigid[0] if compensated is None else rigid[0] - rigid[1]
-        if (power := float(x @ x)) > 0.0 and (own := float(tau @ tau)) > 0.0:
-            slopes[i], correlation[i] = x @ tau / power, x @ tau / np.sqrt(power * own)
+        if (power := float(x @ x)) > 0.0 and (size := float(tau @ tau)) > 0.0:
+            slopes[i], correlation[i] = x @ tau / power, x @ tau / np.sqrt(power * size)
     return slopes, correlation
 
 

@@ -431,8 +431,8 @@ class Reading:
             )
         assert isinstance(self.source, WrenchFrame)
         noise, segment = velocity_noise(self.data), self.data.segment
-        rows = ((segment == own).nonzero()[:, 0] for own in segment.unique_consecutive())
-        logs = (self.momenta(own, noise, correlation) for own in rows)
+        trajectories = ((segment == k).nonzero()[:, 0] for k in segment.unique_consecutive())
+        logs = (self.momenta(rows, noise, correlation) for rows in trajectories)
         mean, covariance = zip(*map(observe, logs), strict=True)
         mean, covariance = (torch.from_numpy(np.concatenate(x)).to(self.data.q) for x in (mean, covariance))
         k = len(self.source.axes)

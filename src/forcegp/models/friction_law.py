@@ -22,7 +22,7 @@ from scipy.optimize import least_squares, nnls
 from torch import Tensor
 
 from forcegp.forces.priors.memory import DISTANCES
-from forcegp.forces.term import SHARPEST
+from forcegp.forces.term import NEAR_REST
 
 Array = NDArray[np.float64]
 PARAMETERS = ("damping", "quadratic", "cubic", "friction", "stribeck", "stribeck_velocity", "bristle")
@@ -31,7 +31,7 @@ RATE = 4.0
 """Ratio of acceleration to speed of the motions [1/s]."""
 COUNT, LEVELS = 16, (3, 6, 9, 12, 15)
 """Number of speeds, and those among them that are the largest of a motion."""
-SLOWEST_SPEED = 2.0 * SHARPEST
+SLOWEST_SPEED = 2.0 * NEAR_REST
 """Smallest speed [rad/s, m/s]. Below it, learned dry friction is smoothed."""
 PHASES = 200
 """Steps in which a bristle is followed from one reversal to the next."""

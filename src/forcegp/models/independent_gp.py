@@ -31,7 +31,6 @@ from forcegp.gp.optimise import Learned, LearningOptions, minimise, reported
 from forcegp.learning.search import box_around, doubts_at_bounds, initial_hyperparameters, negative_log_prior
 from forcegp.models.base import AccelerationFit, FitProgress, Model
 from forcegp.models.fit_result import FitResult
-from forcegp.options import KernelOptions
 from forcegp.resources import announce_memory
 from forcegp.storage.model_file import ModelHeader
 from forcegp.storage.system import take
@@ -79,9 +78,10 @@ class IndependentTraining:
         announce_memory(8 * (2 * nq + copies) * n**2, f"independent Gaussian processes on {n:,} samples")
 
 
-class IndependentSettings(KernelOptions):
+class IndependentSettings(Record):
     """Saved settings of independent Gaussian processes."""
 
+    standardize: bool
     noise_std: PositiveFloat | tuple[PositiveFloat, ...] | None
 
 
@@ -97,7 +97,8 @@ class IndependentGP(Model["IndependentFit"]):
         standardize: whether to standardize the inputs, which the paper does not do.
 
     Raises:
-        ModelError: the robot is not in float64, or `noise` specifies more than acceleration noise.
+        ModelError: the robot is not in float64, `noise` specifies more than acceleration noise, or
+            `standardize` is not a truth value.
     """
 
     kind = KIND
@@ -116,7 +117,9 @@ class IndependentGP(Model["IndependentFit"]):
                 got=noise,
             )
         self.noise = stated.acceleration
-        self.options = KernelOptions.of(self._params)
+        if not isinstance(standardize, bool):
+            raise ModelError("invalid `standardize`", expected="True or False", got=standardize)
+        self.standardize = standardize
 
     def fit(
         self,
@@ -158,7 +161,7 @@ class IndependentGP(Model["IndependentFit"]):
 
     def training(self, features: dict[str, Tensor], qdd: Tensor, noise_std: Tensor) -> IndependentTraining:
         """Return the training data, including the standardization of the inputs."""
-        scaled = Standardization.of if self.options.standardize else Standardization.none
+        scaled = Standardization.of if self.standardize else Standardization.none
         return IndependentTraining(features, qdd, noise_std, scaled(features))
 
 
@@ -264,7 +267,7 @@ class IndependentFit(AccelerationFit):
 
     def record(self) -> tuple[Record, dict[str, Tensor]]:
         model = self.specification
-        settings = IndependentSettings(**dict(model.options), noise_std=plain(model.noise))
+        settings = IndependentSettings(standardize=model.standardize, noise_std=plain(model.noise))
         tensors = {f"training.{name}": value for name, value in self.training.features.items()}
         tensors |= {"training.qdd": self.training.qdd, "training.noise_std": self.training.noise_std}
         tensors |= {f"hyperparameters.{name}": value for name, value in self.hyperparameters.items()}

@@ -1,7 +1,7 @@
 """Structured Gaussian processes in saved files.
 
-An exact posterior is saved with its data, and a sparse posterior with its sums over the data. The options are
-those of `StructuredOptions`. Priors are saved field by field.
+An exact posterior is saved with its data, and a sparse posterior with its sums over the data. Priors
+are saved field by field.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import re
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import torch
 from pydantic import Field, NonNegativeFloat, PositiveFloat, field_serializer
@@ -30,7 +30,7 @@ from forcegp.gp.features import Standardization
 from forcegp.gp.sparse import SparsePosterior
 from forcegp.learning.specification import Specification, constant_inputs
 from forcegp.models.fit_result import FitResult
-from forcegp.options import StructuredOptions
+from forcegp.options import Inference
 from forcegp.priors import (
     AnalyticalMean,
     ContactForcePrior,
@@ -105,13 +105,14 @@ class NoiseSettings(Record):
     external: dict[str, PositiveFloat] | None = None
 
 
-class StructuredSettings(StructuredOptions):
+class StructuredSettings(Record):
     """Saved settings of a structured Gaussian process."""
 
+    inference: Inference
+    inertia: Annotated[str, Field(pattern="^(file|auto)$")] | None
     mean: tuple[str, ...]
     noise: NoiseSettings
     power: float = Field(gt=0.0, le=1.0)
-    correlation_time: float = Field(default=0.0, ge=0.0)
     priors: tuple[dict[str, Any], ...]
     measured: tuple[str, ...]
     constant: tuple[tuple[str, ...], ...]
@@ -159,7 +160,8 @@ def pack(
     noise["state"] = None if stated.state is None else tuple(map(plain, stated.state))
     tensors |= {f"law.{law.name}": law.probe(spec.system) for law in _laws(problem.priors)}
     settings = StructuredSettings(
-        **dict(spec.options),
+        inference=spec.inference,
+        inertia=spec.inertia,
         mean=spec.mean.terms,
         noise=NoiseSettings(**noise),
         power=problem.power,
@@ -254,7 +256,8 @@ def _specification(
         priors,
         Noise(**settings.noise.model_dump()),
         parameters,
-        options=StructuredOptions.of(dict(settings)),
+        inference=settings.inference,
+        inertia=settings.inertia,
     )
 
 
@@ -317,14 +320,11 @@ def _restored(
     system: ConstrainedSystem,
 ) -> Parts:
     """Restore the fit with its weights. Matrices are factorised only when a covariance is needed."""
-    correlation = tensors.get("torque_correlation")
-    if correlation is None and settings.correlation_time > 0.0:  # older models have one time for all joints
-        correlation = torch.full_like(system.robot.mass, settings.correlation_time)
     problem = dataclasses.replace(
         spec.problem(training),
         system=spec.system if spec.analytical_parameters is not None else system,
         power=settings.power,
-        correlation=correlation,
+        correlation=tensors.get("torque_correlation"),
         torque_std=tensors.get("torque_std"),
     )
     posterior = _posterior(*problem.with_coulomb_errors(hyper), tensors)

@@ -456,7 +456,7 @@ class StructuredFit(FittedModel):
                 hint='call model.fit(data, learn=["noise"], after=fit), which learns only the noise',
             )
         values = self.hyperparameters if hyperparameters is None else hyperparameters
-        if not is_sparse(spec.options.inference, self.problem.priors, training.all_samples):
+        if not is_sparse(spec.inference.method, self.problem.priors, training.all_samples):
             training = self._with_slopes(training)
         problem = prepared(spec, dataclasses.replace(self.problem, training=training), values)
         return conditioned(spec, problem, values, warnings=doubts)

@@ -17,14 +17,13 @@ from torch import nn
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset, StreamedDataset
-from forcegp.errors import ModelError
+from forcegp.errors import ModelError, check_name
 from forcegp.forces.measurements import NoiseStd, Observation, excluded, observations_of
 from forcegp.forces.noise import Noise, state_std_of
 from forcegp.forces.priors.base import ForcePrior, check_priors
 from forcegp.forces.priors.joint import AnalyticalMean, JointFrictionPrior, mean_of
 from forcegp.forces.priors.sets import default_priors, friction_priors
 from forcegp.forces.problem import require_double
-from forcegp.gp.inducing import LIMIT
 from forcegp.gp.optimise import LearningOptions
 from forcegp.learning.fit import learned
 from forcegp.learning.regression import SAMPLES, are_columns
@@ -32,7 +31,7 @@ from forcegp.learning.specification import Specification, check_learned, problem
 from forcegp.learning.streamed import Pass, Sample, sample_of
 from forcegp.models.base import FitProgress, Model
 from forcegp.models.structured_fit import KIND, StructuredFit, conditioned
-from forcegp.options import StructuredOptions
+from forcegp.options import Inference
 from forcegp.resources import one_thread
 
 if TYPE_CHECKING:
@@ -58,14 +57,11 @@ class StructuredGP(Model[StructuredFit]):
             a `Noise` for accelerations, torques and states. The default is the value in the log, or 0.1.
         analytical_parameters: a module with a `forward()` method that returns the robot with learned
             analytical parameters θ_A. `None` leaves the robot unchanged.
-        inference: `"exact"`, `"sparse"` or `"auto"`.
-        inducing_points: maximum number of inducing points per prior. Fewer points are used if they suffice.
-            The result of the fit indicates whether more points would help.
+        inference: `"exact"`, `"sparse"` or `"auto"`, or an `Inference`.
         inertia: `"file"` keeps the inertia of the robot. `"auto"` identifies the inertia of links and drives
             that the log determines (`learning/inertia.py`). It requires a
             `JointFrictionPrior` and a mean that includes the motor torque. `None` means `"auto"` for
             automatically selected priors, and `"file"` otherwise.
-        standardize: whether to standardize kernel inputs, which the paper does not do.
 
     Example:
         >>> import forcegp, torch
@@ -91,14 +87,13 @@ class StructuredGP(Model[StructuredFit]):
         force_priors: Sequence[ForcePrior] | None = None,
         noise: NoiseStd | Noise | None = None,
         analytical_parameters: nn.Module | None = None,
-        inference: str = "auto",
-        inducing_points: int = LIMIT,
+        inference: str | Inference = "auto",
         inertia: str | None = None,
-        standardize: bool = True,
     ) -> None:
         self._keep(locals())
         require_double(system)
-        form, stated, options = mean_of(mean), Noise.of(noise), StructuredOptions.of(self._params)
+        form, stated = mean_of(mean), Noise.of(noise)
+        check_name("inertia", "auto" if inertia is None else inertia, ("file", "auto"))
         around = "actuation" in form.terms
         automatic = force_priors is None and around
         if force_priors is None:
@@ -114,7 +109,8 @@ class StructuredGP(Model[StructuredFit]):
             stated if automatic else stated.for_priors(priors),
             analytical_parameters,
             automatic,
-            options,
+            inference if isinstance(inference, Inference) else Inference(inference),  # pyright: ignore
+            inertia,
         )
 
     @property
@@ -218,11 +214,12 @@ class StructuredGP(Model[StructuredFit]):
     def _without_effect(self, fit: StructuredFit) -> Iterator[str]:
         """Yield a warning for each given option that had no effect on a fit."""
         points = [x for Z in fit.problem.inducing or () for x in Z.values()]
-        if self._params["inducing_points"] != LIMIT and not any(map(len, points)):
+        most = self.specification.inference.inducing_points
+        if most != Inference().inducing_points and not any(map(len, points)):
             how = "exact inference" if fit.problem.inducing is None else "priors with finitely many features"
-            yield f"inducing_points={self._params['inducing_points']} has no effect: the fit has {how}"
+            yield f"inducing_points={most} has no effect: the fit has {how}"
         friction = any(isinstance(prior, JointFrictionPrior) for prior in fit.force_priors)
-        if self._params["inertia"] == "auto" and not (friction and "actuation" in self.mean.terms):
+        if self.specification.inertia == "auto" and not (friction and "actuation" in self.mean.terms):
             lacks = "the motor torque in its mean" if friction else "a JointFrictionPrior"
             yield f'inertia="auto" has no effect: the model lacks {lacks}'
 

@@ -39,6 +39,7 @@ from forcegp.forces.priors.base import ForcePrior
 from forcegp.forces.priors.contact import CoulombFriction, SurfaceForcePrior, coulomb_response, with_coulomb
 from forcegp.forces.priors.joint import AnalyticalMean
 from forcegp.forces.quantities import ForceField, States, affine_map
+from forcegp.forces.term import NEAR_REST
 from forcegp.rollout.cone import accelerating, arrested, sliding_away, sticking_contacts
 from forcegp.rollout.inputs import CompiledMotion, ForwardModel, Inputs, Reached
 
@@ -56,8 +57,6 @@ INSTANT = 1e-12
 """Step size that represents an instant [s], over which every moving joint slides."""
 STILL = 1e-8
 """Speed up to which a joint counts as at rest [rad/s, m/s]. Sticking joints creep due to rounding errors."""
-SMOOTH = 0.02
-"""Speed scale for smoothing learned "friction" that drives a joint, and so cannot stick [rad/s, m/s]."""
 SATURATED = 10.0
 """Speed, relative to the scale of smoothed Coulomb friction, above which a contact slides."""
 NUDGE = 1e-4
@@ -125,7 +124,8 @@ def split(system: ConstrainedSystem, at: States, force: ForceField) -> DryFricti
     slower = torch.where(at.qd < 0.0, backward, forward)
     damping = (way * (slower - sliding(way, NUDGE)) / NUDGE).clamp(min=0.0)
     limit = 0.5 * (backward - forward)
-    Q = 0.5 * (forward + backward) + limit.clamp(max=0.0).neg() * torch.tanh(at.qd / SMOOTH)
+    # Learned "friction" that drives a joint cannot stick.
+    Q = 0.5 * (forward + backward) + limit.clamp(max=0.0).neg() * torch.tanh(at.qd / NEAR_REST)
     if unknown is not None:
         Q = Q + unknown.unknown_force(system, at, others)
     Q_bar = with_coulomb(system, at, Q, coulomb)

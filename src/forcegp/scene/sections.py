@@ -12,7 +12,7 @@ from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, Pos
 
 from forcegp.constraints import Baumgarte
 from forcegp.files import Record
-from forcegp.options import StructuredOptions, Window
+from forcegp.options import Inference, Window
 from forcegp.robot.tree import Base
 from forcegp.simulate.config import SimulationConfig
 from forcegp.storage.system import ConnectionFields, ContactFields, Point
@@ -62,14 +62,17 @@ class NoiseSection(Section):
     external: dict[str, PositiveFloat] | None = None
 
 
-class ModelSection(Section, StructuredOptions):
-    """`[model]`: options of models, and the additional keys that `forcegp.models.configured` uses."""
+class ModelSection(Section):
+    """`[model]`: arguments of models, and the additional keys that `forcegp.models.configured` uses."""
 
     name: str | None = None
     noise: NoiseSection = NoiseSection()
     sensor_noise_std: PositiveFloat | None = None
     mean: Literal["zero", "analytical"] | tuple[str, ...] = "analytical"
     priors: tuple[dict[str, Any], ...] = ()
+    inference: Inference = Inference()
+    inertia: Literal["file", "auto"] | None = None
+    standardize: bool = True
     analytical_parameters: dict[str, Literal["all"] | tuple[str, ...]] = Field(default_factory=dict)
     hidden: tuple[PositiveInt, ...] = ()
     window: Window = Window()
@@ -81,6 +84,12 @@ class ModelSection(Section, StructuredOptions):
     def _of_accelerations(cls, value: object) -> object:
         """Interpret a number or a list of numbers as the noise in the accelerations."""
         return _tuples({"acceleration": value} if isinstance(value, int | float | list) else value)
+
+    @field_validator("inference", mode="before")
+    @classmethod
+    def _of_method(cls, value: object) -> object:
+        """Interpret a string as the method."""
+        return {"method": value} if isinstance(value, str) else value
 
 
 def _tuples(value: Any) -> Any:

@@ -62,7 +62,7 @@ class ModelHeader(Header):
     """Header of a saved model: its `Model.kind`, settings, and system as returned by `pack_system`."""
 
     FORMAT: ClassVar[str] = "forcegp-model"
-    VERSION: ClassVar[int] = 4
+    VERSION: ClassVar[int] = 5
 
     kind: str
     settings: dict[str, Any]

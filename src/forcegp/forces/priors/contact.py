@@ -126,6 +126,7 @@ class ContactForcePrior(SurfaceForcePrior):
         kernel: covariance of each component.
         inputs: inputs of the force, chosen from the tangential `position`, `velocity` and `speed`.
         name: prefix of the hyperparameters; defaults to the name of the contact.
+        scaled: whether to standardize the inputs, which the paper does not do.
 
     Example:
         >>> ContactForcePrior("table").target
@@ -134,6 +135,8 @@ class ContactForcePrior(SurfaceForcePrior):
     Raises:
         UnknownNameError: an input is not one of the three.
     """
+
+    scaled: bool = field(default=True, kw_only=True)
 
     def outputs(self, robot: RobotModel) -> int:
         return 2
@@ -276,7 +279,8 @@ class NormalForcePrior(ForcePrior):
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "name", f"{self.like.name}_normal")
-        object.__setattr__(self, "kernel", self.like.kernel)
+        for name in ("kernel", "scaled"):
+            object.__setattr__(self, name, getattr(self.like, name))
 
     @property
     def prefix(self) -> str:

@@ -88,6 +88,7 @@ class JointForcePrior(PerJointPrior):
         inputs: inputs of the force, from `q`, `qd` and `tau`.
         periodic: whether to replace the angle of each revolute joint by its sine and cosine.
         name: prefix of the hyperparameters.
+        scaled: whether to standardize the inputs, which the paper does not do.
 
     Example:
         >>> from forcegp.gp.kernels import SquaredExponential
@@ -103,6 +104,7 @@ class JointForcePrior(PerJointPrior):
     periodic: bool = False
     name: str = "joint"
     target: str = JOINT
+    scaled: bool = field(default=True, kw_only=True)
 
     def __post_init__(self) -> None:
         check_inputs(self.name, self.inputs, ("q", "qd", "tau"))

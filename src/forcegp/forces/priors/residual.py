@@ -24,6 +24,7 @@ class ResidualPrior(JointForcePrior):
         inputs: the inputs.
         periodic: whether to replace angles by their sine and cosine.
         name: prefix of the hyperparameters.
+        scaled: whether to standardize the inputs.
 
     Example:
         >>> ResidualPrior().inputs

@@ -3,7 +3,7 @@
 #define FORCEGP_NO_FRICTION @no_friction@
 enum { PRIORS = @priors@, MOST_WAVES = @waves@, MAX_EXCHANGES = @max_exchanges@, BLOCK_TRIALS = @block_trials@ };
 static const double REGULARIZATION = @regularization@, CONTRADICTION = @contradiction@, INSTANT = @instant@;
-static const double STILL = @still@, SMOOTH = @smooth@, NUDGE = @nudge@;
+static const double STILL = @still@, NEAR_REST = @near_rest@, NUDGE = @nudge@;
 static const int STICKS[] = {@sticks@}, FIRST[] = {@first@};
 static const int X[PRIORS][3] = {@inputs@}; /* position, rows and width of the inputs of each prior */
 
@@ -140,7 +140,7 @@ static int motion(const double *folded, const waves *w, long sample, const doubl
       limit[i] = 0.5 * (backward[i] - forward[i]);
       damping[i] = fmax(way[i] * ((way[i] < 0.0 ? backward[i] : forward[i]) - faster[i]) / NUDGE, 0.0);
       force[i] += 0.5 * (forward[i] + backward[i]) - MEAN_TERMS[2] * e.Q_D[i];
-      force[i] += fmax(-limit[i], 0.0) * tanh(qd[i] / SMOOTH), limit[i] = fmax(limit[i], 0.0);
+      force[i] += fmax(-limit[i], 0.0) * tanh(qd[i] / NEAR_REST), limit[i] = fmax(limit[i], 0.0);
     }
   }
   read_mean(&z, &f, force, size, both);

@@ -44,7 +44,7 @@ from forcegp.rollout import law
 NO_FRICTION = 10
 """Error code of the C code if no dry friction solves the problem in `rollout/law.py`."""
 LAW = ("REGULARIZATION", "CONTRADICTION", "BLOCK_TRIALS", "MAX_EXCHANGES")
-LAW += ("INSTANT", "STILL", "SMOOTH", "NUDGE")
+LAW += ("INSTANT", "STILL", "NEAR_REST", "NUDGE")
 READ = tuple(PREDICTED)
 """Quantities of the C code, in the order of their bits."""
 STEPS = 2e-5, 1e-3
