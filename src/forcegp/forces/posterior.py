@@ -30,7 +30,7 @@ from forcegp.forces.measurements import Training
 from forcegp.forces.priors.base import CONSTRAINT, CONTACT, JOINT, NOISE, ForceMean, ForcePrior
 from forcegp.forces.priors.contact import CoulombFriction, coupled, with_coulomb
 from forcegp.forces.quantities import DOUBTS, AffineMap, States, affine_map, hidden_forces
-from forcegp.forces.term import NEAR_REST, JointTerm
+from forcegp.forces.term import JointTerm
 from forcegp.gp.draws import FunctionSamples
 from forcegp.gp.exact import ExactPosterior
 from forcegp.gp.features import Block, Standardization
