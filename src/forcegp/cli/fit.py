@@ -190,8 +190,8 @@ def _listed(parameters: Sequence[RobotParameter]) -> str:
 
     known = [p for p in parameters if p.determined and abs(p.value) > CLEAR * (p.std or 0.0)]
     texts = [f"{label(p)} {rounded(p.value, p.std)} {p.unit}".strip() for p in known]
-    links = parameters[0].name.startswith("link ")
-    # Most parameters of single links are never determined.
+    links = parameters[0].name.startswith(("link ", "payload "))
+    # Most parameters of single links and payloads are never determined.
     missing = [label(p) for p in parameters if not p.determined and not links]
     if len(missing) == len(parameters):
         return "not determined"
