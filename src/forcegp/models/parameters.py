@@ -113,6 +113,7 @@ def _of_prior(
                 deviation = deviation.clamp(min=prior.spread[k] / float(unit))
             yield _parameter(f"{prior.name}.scale of {joint}", mean, deviation, unit, "")
     if isinstance(prior, PerRecording) and isinstance(prior.prior, PayloadPrior):
+        assert isinstance(prior.kernel, Constant)
         places, payload = (*prior.recordings, ""), prior.prior
         units = payload.units(w).repeat_interleave(len(places)) * prior.kernel.std(params)
         least = torch.zeros_like(units).view(-1, len(places))
