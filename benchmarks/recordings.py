@@ -4,11 +4,11 @@
     python benchmarks/recordings.py --case offsets --seed 0 1 2 --arm ur5 kuka_iiwa14
 
 An arm of `solver_arms.py` records several motions, each with its own offsets of the torque sensors, its own
-payload, or neither. The defaults know the recordings, `one log` does not, and `payloads` has the payload of
-each recording in addition. Errors, over those of `one log`, and ±2σ coverage of torques are counted as on
-real logs (`real_logs.py`), on another motion of a training recording (`known`), and on another recording
-(`new`). The case `masses` compares payloads from one fit of all recordings with those from a fit of each
-[kg].
+payload, or neither. The defaults know the recordings and find payloads, `one log` does not know them, and
+`payloads` is given the payload of each recording as a point mass. Errors, over those of `one log`, and ±2σ
+coverage of torques are counted as on real logs (`real_logs.py`), on another motion of a training recording
+(`known`), and on another recording (`new`). The case `masses` compares payloads from one fit of all
+recordings with those from a fit of each [kg].
 """
 
 from __future__ import annotations

@@ -126,9 +126,12 @@ OFFSETS = ((0.8, 0.0), (-0.5, 0.0), (0.4, 0.0))
 """Offsets of the torque sensors in three recordings [N m]; joint 2 has none."""
 
 
-def _offset(seed: int, offset: tuple[float, float], name: str) -> forcegp.Dataset:
+def _offset(
+    seed: int, offset: tuple[float, float], name: str, carrying: forcegp.RobotModel | None = None
+) -> forcegp.Dataset:
     """A recording of an arm with friction along a smooth motion, with an offset of the logged torques."""
-    robot, generator = forcegp.load_robot("double_pendulum"), torch.Generator().manual_seed(seed)
+    robot = carrying or forcegp.load_robot("double_pendulum")
+    generator = torch.Generator().manual_seed(seed)
     t = 0.01 * torch.arange(800, dtype=torch.float64)
     size, w, phase = torch.rand(3, 4, 2, generator=generator, dtype=torch.float64)
     w, angle = 1.0 + 4.0 * w, t[:, None, None] * (1.0 + 4.0 * w) + 6.0 * phase
@@ -204,6 +207,53 @@ def test_recordings_that_do_not_differ_or_are_unknown_have_no_offsets() -> None:
     for data in (one, mixed, *map(forcegp.Dataset.concatenate, (still, touching))):
         spec = forcegp.StructuredGP(system).specification.for_data(data)
         assert not any(isinstance(prior, OffsetPrior) for prior in spec.priors)
+
+
+LOAD = 0.6
+"""Mass that the arm carries in the second of two recordings [kg]."""
+
+
+@pytest.fixture(scope="module")
+def carried() -> StructuredFit:
+    """A default fit of a recording without a payload and one with it."""
+    robot = forcegp.load_robot("double_pendulum")
+    parts = [_offset(0, (0.0, 0.0), "empty"), _offset(1, (0.0, 0.0), "loaded", _loaded(robot, LOAD))]
+    return forcegp.StructuredGP(forcegp.ConstrainedSystem(robot)).fit(forcegp.Dataset.concatenate(parts))
+
+
+def test_a_default_fit_learns_the_payload_of_a_recording(carried: StructuredFit, tmp_path: Path) -> None:
+    assert carried.result.worth["payload"] > 100.0
+    found = {each.name: each for each in carried.robot_parameters() if each.of == "loaded"}
+    mass = found["payload mass"]
+    assert mass.unit == "kg" and mass.determined and mass.std is not None
+    assert 0.02 * LOAD <= mass.std < 0.1 and abs(mass.value - LOAD) <= SIGMAS * mass.std
+    # The links are those of the first recording, and the robot file has the right ones.
+    file, robot = carried.specified.robot, carried.system.robot
+    assert float((robot.mass - file.mass).abs().max()) < 0.05 * LOAD
+    test = _offset(5, (0.0, 0.0), "loaded", _loaded(file, LOAD))
+    errors = [
+        float((carried.predict_log(log).mean - test.qdd).square().mean().sqrt())
+        for log in (test, test.named("another"))
+    ]
+    assert errors[0] < 0.2 * errors[1]
+    carried.save(tmp_path / "fit")
+    again = forcegp.load_model(tmp_path / "fit")
+    assert isinstance(again, StructuredFit)
+    torch.testing.assert_close(again.predict_log(test).mean, carried.predict_log(test).mean)
+
+
+def test_code_of_a_fit_has_the_payload_of_an_unknown_recording(carried: StructuredFit) -> None:
+    test = _offset(6, (0.0, 0.0), "empty")[::20]
+    plain = carried.predict(test.q, test.qd, test.tau)
+    compiled = carried.compiled(jacobians=False).predict(test.q, test.qd, test.tau)
+    torch.testing.assert_close(compiled.mean, plain.mean, rtol=1e-7, atol=1e-9)
+    assert compiled.std is not None
+    torch.testing.assert_close(compiled.std, plain.std, rtol=1e-6, atol=1e-9)
+
+
+def test_recordings_with_the_same_payload_have_none(of_recordings: StructuredFit) -> None:
+    """Not even with different offsets."""
+    assert not any(isinstance(prior, PerRecording) for prior in of_recordings.force_priors)
 
 
 def test_a_joint_without_reversal_has_no_offset() -> None:

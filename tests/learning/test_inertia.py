@@ -397,7 +397,8 @@ def test_averaged_equations_are_sums_of_neighbours_within_a_stretch() -> None:
     weight = torch.ones_like(r)
     weight[30, 0] = 0.3
     rows = Rows(
-        r, r, r, r, Phi, weight, group, group, torch.cat([i + n, i]), Phi[..., :0], r, 0.0 * r, 0.01, 0.03**2
+        *(r, r, r, r, Phi, weight, group, group, group, torch.cat([i + n, i])),
+        *(Phi[..., :0], r, 0.0 * r, 0.01, 0.03**2),
     )
     mean, columns = averaged(rows, C, inertial, 0.04)
     assert mean.step == 0.02 and len(columns) == 2 * len(range(15, n - 15, 2))
@@ -471,7 +472,8 @@ def test_sums_give_the_dense_least_squares(monkeypatch: pytest.MonkeyPatch) -> N
     r, tau = torch.randn(2, n, nq, generator=random, dtype=torch.float64)
     group = torch.arange(n) * 3 // n
     moves = torch.ones_like(r)
-    by_stretch = sums(Rows(r, r, r, r, Phi, moves, group, group, torch.arange(n), Phi[..., :0], tau, r), C)
+    along = group, group, group, torch.arange(n)
+    by_stretch = sums(Rows(r, r, r, r, Phi, moves, *along, Phi[..., :0], tau, r), C)
     every, rest = by_stretch.total(), by_stretch.without(1)
     for given, own in ((every, group >= 0), (rest, group != 1)):
         H, h, per_gain = given.quadratic(NOISE)
@@ -502,7 +504,7 @@ def test_instruments_give_the_textbook_estimate(monkeypatch: pytest.MonkeyPatch)
     partner = torch.cat([torch.arange(n // 2) + n // 2, torch.arange(n // 2)])
     group = torch.arange(n // 2).repeat(2) * 3 // (n // 2)
     weight = 0.2 + 0.8 * torch.rand(n, nq, generator=random, dtype=torch.float64)
-    rows = Rows(r, r, r, r, Phi, weight, group, group, partner, Phi[..., :0], r, r)
+    rows = Rows(r, r, r, r, Phi, weight, group, group, group, partner, Phi[..., :0], r, r)
     every = instrumental(rows, C).total()
     delta = torch.linalg.solve(*every.quadratic(NOISE)[:2])
     X, Z = (torch.zeros(n, nq, p + nq * f, dtype=torch.float64) for _ in range(2))

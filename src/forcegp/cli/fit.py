@@ -314,8 +314,8 @@ def _listed(parameters: Sequence[RobotParameter], short: Mapping[str, str]) -> t
     units = {p.unit for p in known}
     (unit,) = units if len(units) == 1 else ("",)
     texts = [f"{label(p)} {rounded(p.value, p.std)} {'' if unit else p.unit}".strip() for p in known]
-    links = group == "link"
-    # Most parameters of single links are never determined.
+    links = group in ("link", "payload")
+    # Most parameters of single links and payloads are never determined.
     missing = [label(p) for p in parameters if not p.determined and not links]
     heading = f"{group} [{unit}] " if unit else f"{group} "
     return heading * bool(texts) + _first(texts), ALL if missing and len(missing) == len(

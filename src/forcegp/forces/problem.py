@@ -22,6 +22,7 @@ from forcegp.forces.measurements import Measurement, Training, scaled
 from forcegp.forces.noise import TORQUE_NOISE, ForceNoise, SampleNoise, state_jacobian
 from forcegp.forces.posterior import ForcePosterior, ForceProcess, hidden_variance, trained_region
 from forcegp.forces.priors.base import ANALYTICAL, NOISE, RESERVED, ForceMean, ForcePrior
+from forcegp.forces.priors.constants import PerRecording
 from forcegp.forces.priors.contact import CoulombErrorPrior, CoulombFriction, coulomb_of
 from forcegp.forces.projection import WhitenedRows, combine, whiten
 from forcegp.forces.term import NEAR_REST, ExpectedForce
@@ -377,6 +378,31 @@ def posterior_of(
     latent = SparsePosterior.of(basis, sums, len(problem.errors))
     latent.require_resolved()
     return ForcePosterior(problem.process_at(hyperparameters), latent)
+
+
+def of_unknown_recording(
+    problem: Problem, hyperparameters: Mapping[str, Tensor], posterior: ForcePosterior
+) -> ForcePosterior:
+    """Return the posterior with constants of a recording that is not in the training data.
+
+    Constants of the training recordings are marginalised.
+    """
+    latent, each = posterior.latent, [isinstance(prior, PerRecording) for prior in posterior.priors]
+    if not any(each) or not isinstance(latent, SparsePosterior):
+        return posterior
+    basis, kept = latent.basis, torch.ones(latent.basis.size, dtype=torch.bool)
+    priors, parts = list(posterior.priors), list(basis.parts)
+    for p, prior in enumerate(posterior.priors):
+        if isinstance(prior, PerRecording):
+            # The last place is that of an unknown recording.
+            kept[basis.of_process(p)].view(-1, len(prior.recordings) + 1)[:, :-1] = False
+            priors[p], count = prior.prior, prior.prior.outputs(problem.system.robot)
+            parts[p] = dataclasses.replace(parts[p], kernel=prior.prior.kernel, components=count)
+    sums = latent.drifting(0.0, [p for p, differs in enumerate(each) if differs]).sums
+    sums = dataclasses.replace(sums, G=sums.G[kept][:, kept], v=sums.v[kept])
+    basis = LatentBasis(tuple(priors), basis.params, tuple(parts))
+    process = dataclasses.replace(problem, priors=tuple(priors)).process_at(hyperparameters)
+    return ForcePosterior(process, SparsePosterior.of(basis, sums, latent.errors))
 
 
 EXACT_SAMPLES = 1000

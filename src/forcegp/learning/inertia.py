@@ -194,7 +194,7 @@ def _regressions(
     rows: Rows, inertial: Tensor, M: Tensor, scale_std: float | None = None
 ) -> tuple[tuple[_Regression, ...], _Regression]:
     """Return the regressions over all widths, and the one with the narrowest posterior."""
-    each = tuple(_over_widths(rows, inertial, M, scale_std))
+    each = tuple(over_widths(rows, inertial, M, scale_std))
     return each, max(each, key=lambda one: float(torch.logdet(one.normal()[1])))
 
 
@@ -338,7 +338,7 @@ def _marginal(precision: Tensor, kept: Tensor, others: Tensor) -> Tensor:
     return precision[kept][:, kept] - across @ torch.linalg.solve(precision[others][:, others], across.mT)
 
 
-def _over_widths(
+def over_widths(
     rows: Rows, inertial: Tensor, M: Tensor, scale_std: float | None = None
 ) -> Iterator[_Regression]:
     """Yield, for each averaging width, a regression on equations averaged over time.

@@ -58,6 +58,8 @@ WIDEST = 4.0 * LATE
 """Longest time between two samples whose difference counts as a derivative [s]."""
 COHERENT = 0.9
 """Minimum autocorrelation between the velocities of a sample and its partner (median over the joints)."""
+CENTRED = ("q", "qd", "qdd", "group", "segment", "recording")
+"""Fields of samples that an average over time takes from its middle."""
 
 
 @dataclass(frozen=True)
@@ -71,6 +73,7 @@ class Rows:
         weight: `(n, nq)` inverse standard deviation of each torque, relative to that of moving joints.
         group: block index of each sample `(n,)`, numbered from 0 without gaps.
         segment: trajectory number of each sample `(n,)`.
+        recording: number of the recording of each sample `(n,)`.
         partner: index of each sample's partner `(n,)`; for a sample without a partner, its own index.
         memory: additional features `(n, nq, k)` for friction with memory.
         tau: measured torque `(n, nq)`.
@@ -87,6 +90,7 @@ class Rows:
     weight: Tensor
     group: Tensor
     segment: Tensor
+    recording: Tensor
     partner: Tensor
     memory: Tensor
     tau: Tensor
@@ -181,7 +185,11 @@ Estimate = Callable[[NormalEquations], Tensor]
 
 
 def free_rows(
-    system: ConstrainedSystem, laws: Sequence[JointTerm], mean: ForceMean, training: Training
+    system: ConstrainedSystem,
+    laws: Sequence[JointTerm],
+    mean: ForceMean,
+    training: Training,
+    most: int = MOST,
 ) -> Rows:
     """Return samples in free motion, and their partners, from the first measurement with enough of them."""
     motions = (m for m in training.measurements if m.quantity == "qdd")
@@ -193,7 +201,7 @@ def free_rows(
     paired = len(first) >= LEAST
     if not paired:
         first = torch.arange(len(m.t), device=m.t.device)
-    first = first[torch.linspace(0, len(first) - 1, min(MOST, len(first))).round().long().to(m.t.device)]
+    first = first[torch.linspace(0, len(first) - 1, min(most, len(first))).round().long().to(m.t.device)]
     _, group = stretches(m.segment[first]).unique(return_inverse=True)
     i = torch.arange(len(first), device=m.t.device)
     if not paired:
@@ -296,7 +304,8 @@ def _rows(
     qd, qdd, tau = robot.drive_motion(m.qd), robot.drive_motion(m.values), robot.drive_torque(m.tau)
     slowest = min(min(law.speeds) for law in laws if isinstance(law, JointFrictionPrior))
     weight = rest_weight(qd.abs(), slowest, Phi, residual)
-    return Rows(m.q, qd, qdd, residual, Phi, weight, group, m.segment, partner, memory, tau, rate)
+    along = group, m.segment, m.recording, partner
+    return Rows(m.q, qd, qdd, residual, Phi, weight, *along, memory, tau, rate)
 
 
 def rest_weight(speed: Tensor, slowest: float, Phi: Tensor, residual: Tensor) -> Tensor:
@@ -372,7 +381,7 @@ def averaged(rows: Rows, columns: Tensor, inertial: Tensor, width: float) -> tup
 
     whole = torch.stack([shifted(x, 0) == shifted(x, 2 * reach) for x in (rows.group, rows.segment)]).all(0)
     least = torch.stack([shifted(rows.weight, k) for k in range(2 * reach + 1)]).amin(0)
-    centre = {name: shifted(getattr(rows, name), reach) for name in ("q", "qd", "qdd", "group", "segment")}
+    centre = {name: shifted(getattr(rows, name), reach) for name in CENTRED}
     i = torch.arange(count, device=columns.device)
     result = dataclasses.replace(
         rows,

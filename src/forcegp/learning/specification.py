@@ -30,15 +30,17 @@ from forcegp.forces.noise import Noise, external_std, state_std_of
 from forcegp.forces.posterior import REGION
 from forcegp.forces.priors.base import ANALYTICAL, COULOMB, NOISE, ForcePrior
 from forcegp.forces.priors.constants import DrivePrior, OffsetPrior, PerRecording
-from forcegp.forces.priors.inertial import InertialPrior
+from forcegp.forces.priors.inertial import InertialPrior, PayloadPrior
 from forcegp.forces.priors.joint import AnalyticalMean, ConstantForcePrior, JointFrictionPrior
 from forcegp.forces.priors.memory import DISTANCES, LONGEST_STEP, PAST, BristlePrior
 from forcegp.forces.priors.residual import ResidualPrior
 from forcegp.forces.problem import Problem
+from forcegp.forces.term import JointTerm
 from forcegp.gp.features import Standardization
 from forcegp.gp.optimise import LearningOptions
 from forcegp.learning.inertia import Inertia, inertia_of
 from forcegp.learning.inverse_dynamics import LEAST, without_delay
+from forcegp.learning.payloads import Payloads, payloads_of
 from forcegp.learning.search import Search, initial
 from forcegp.options import Inference
 from forcegp.robot.model import RobotModel
@@ -127,19 +129,45 @@ class Specification:
         by_name = {prior.name: prior for prior in self.priors}
         return dataclasses.replace(self, priors=tuple(by_name.get(p.name, p) for p in problem.priors))
 
-    def inertia_of(self, training: Training) -> Inertia:
-        """Return the inertia identified from the training samples if requested, or that of the robot file."""
-        laws = [prior for prior in self.priors if isinstance(prior, JointFrictionPrior | OffsetPrior)]
+    def inertia_of(self, training: Training, payloads: Payloads | None = None) -> Inertia:
+        """Return the inertia identified from the training samples if requested, or that of the robot file.
+
+        Args:
+            payloads: payloads of the recordings, which are not part of the links.
+        """
         scale = next((prior.std for prior in self.priors if isinstance(prior, DrivePrior)), None)
         links = self.inertia == "auto"
-        known = "actuation" in self.mean.terms and self.analytical_parameters is None
-        asks = known and (links or (self.automatic and scale is not None))
-        lacks = not any(isinstance(law, JointFrictionPrior) for law in laws)
-        if lacks or not asks or any(isinstance(prior, InertialPrior) for prior in self.priors):
+        if not self._identifiable or not (links or (self.automatic and scale is not None)):
             return Inertia(self.system.robot)
-        inertia = inertia_of(self.system, laws, self.mean, training, scale, links)
+        mean = self.mean if payloads is None else payloads.carried(self.mean)
+        inertia = inertia_of(self.system, self._laws, mean, training, scale, links)
         checked = training.free_motions >= LEAST or not bool(self.system.robot.driven.all())
         return inertia if checked else replace(inertia, doubts=_unchecked_masses(training))
+
+    def payloads_of(self, training: Training, recordings: Sequence[str]) -> Payloads | None:
+        """Return the payloads that differ between recordings, or `None` if the log does not show any.
+
+        The links of a robot without a fixed base are not identified from free motion.
+        """
+        known = any(isinstance(prior, PerRecording | PayloadPrior) for prior in self.priors)
+        asks = self.automatic and self.inertia == "auto" and self._identifiable and not known
+        short = training.free_motions < LEAST or not bool(self.system.robot.driven.all())
+        if not asks or short or len(recordings) < 2:
+            return None
+        return payloads_of(self.system, self._laws, self.mean, training, recordings)
+
+    @property
+    def _laws(self) -> list[JointTerm]:
+        """Return the terms of joints that are eliminated if the inertia is identified."""
+        return [prior for prior in self.priors if isinstance(prior, JointFrictionPrior | OffsetPrior)]
+
+    @property
+    def _identifiable(self) -> bool:
+        """Whether torques are known, and no prior on links or other parameters is given."""
+        given = any(isinstance(prior, InertialPrior) for prior in self.priors)
+        has_friction = any(isinstance(law, JointFrictionPrior) for law in self._laws)
+        known = "actuation" in self.mean.terms and self.analytical_parameters is None
+        return known and has_friction and not given
 
     def problem(self, training: Training, robot: RobotModel | None = None) -> Problem:
         """Return the learning problem for training data.
@@ -170,11 +198,11 @@ def _of_recordings(
 
     In contact, an offset cannot be told from contact forces, which balance it.
     """
-    known = any(isinstance(prior, OffsetPrior | PerRecording) for prior in priors)
-    unnamed = any(bool((o.data.recording == UNKNOWN).any()) for o in observations)
-    common_recordings([o.data.header for o in observations])
-    names = tuple(dict.fromkeys(name for o in observations for name in o.data.recordings))
-    if known or unnamed or len(names) < 2:
+    known, names = (
+        any(isinstance(prior, OffsetPrior | PerRecording) for prior in priors),
+        names_of(observations),
+    )
+    if known or len(names) < 2:
         return ()
     q, qd = (robot.drive_motion(torch.cat([getattr(o.data, x) for o in observations])) for x in ("q", "qd"))
     recording = torch.cat([o.data.recording for o in observations])
@@ -182,6 +210,14 @@ def _of_recordings(
     masks = (free & (recording == recording_number(name)) for name in names)
     offsets = OffsetPrior(names, tuple(tuple(reverses(q[rows], qd[rows])) for rows in masks))
     return (offsets,) if any(offsets.separable) else ()
+
+
+def names_of(observations: Sequence[Observation]) -> tuple[str, ...]:
+    """Return the names of the recordings, or no name if some samples have none."""
+    common_recordings([o.data.header for o in observations])
+    if any(bool((o.data.recording == UNKNOWN).any()) for o in observations):
+        return ()
+    return tuple(dict.fromkeys(name for o in observations for name in o.data.recordings))
 
 
 def _unchecked_masses(training: Training) -> tuple[str, ...]:
@@ -225,13 +261,17 @@ def problem_for(
     if before is not None and any(prior.is_error for prior in spec.priors):
         robot = before.system.robot
     elif before is None and chosen is None:
-        inertia = spec.inertia_of(training)
+        payloads = spec.payloads_of(training, names_of(observations_of(data)))
+        inertia, plain = spec.inertia_of(training, payloads), spec
         robot, doubts = inertia.robot, (*doubts, *inertia.doubts)
         if inertia.spread:
             spec = spec.with_spread(inertia.spread)
-        if inertia.errors is not None:
-            spec = dataclasses.replace(spec, priors=(*spec.priors, inertia.errors))
-        if inertia.spread or inertia.errors is not None:
+        # Errors of the inertia come last.
+        further = [*([] if payloads is None else [payloads.prior]), inertia.errors]
+        spec = dataclasses.replace(
+            spec, priors=(*spec.priors, *(prior for prior in further if prior is not None))
+        )
+        if spec.priors != plain.priors:
             training, _ = training_for(spec, before, data, chosen)
     return spec, spec.problem(dataclasses.replace(training, part_of=part_of), robot), doubts
 

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from forcegp.forces.posterior import ForcePosterior
 from forcegp.forces.priors.base import ForcePrior
-from forcegp.forces.priors.constants import DrivePrior
+from forcegp.forces.priors.constants import DrivePrior, PerRecording
 from forcegp.forces.priors.inertial import InertialPrior, PayloadPrior
 from forcegp.forces.term import FORCE, JointTerm
 from forcegp.gp.kernels import Constant, Linear, sub
@@ -107,6 +107,20 @@ def _of_prior(
                 mean = (robot.torque_scale[k] - 1.0) / unit
                 deviation = deviation.clamp(min=prior.spread[k] / float(unit))
             yield _parameter(f"{prior.name}.scale of {joint}", mean, deviation, unit, "")
+    if isinstance(prior, PerRecording) and isinstance(prior.prior, PayloadPrior):
+        assert isinstance(prior.kernel, Constant)
+        places, payload = (*prior.recordings, ""), prior.prior
+        units = payload.units(w).repeat_interleave(len(places)) * prior.kernel.std(params)
+        least = torch.zeros_like(units).view(-1, len(places))
+        if prior.spread:
+            least[:, :-1] = least.new_tensor(prior.spread).mT
+        joint = robot.joint_names[payload.link(robot)]
+        deviation = torch.maximum(std[:, 0], least.flatten() / units)
+        for k, unit in enumerate(units):
+            index, place = divmod(k, len(places))
+            name = f"{PARAMETER_NAMES[index]}_{places[place]}" if places[place] else PARAMETER_NAMES[index]
+            text = f"{prior.name}.{name} of {joint}"
+            yield _parameter(text, w[k, 0], deviation[k], unit, INERTIAL[index])
     if isinstance(prior, PayloadPrior | InertialPrior) and isinstance(prior.kernel, Constant):
         links = robot.nq * len(PARAMETER_NAMES)
         sizes = prior.units(w) if isinstance(prior, PayloadPrior) else prior.scale(robot)

@@ -19,7 +19,7 @@ from torch import Tensor
 from forcegp.constraints import ConstrainedSystem
 from forcegp.forces.measurements import Training
 from forcegp.forces.posterior import ForcePosterior
-from forcegp.forces.priors.constants import DrivePrior
+from forcegp.forces.priors.constants import DrivePrior, PerRecording
 from forcegp.forces.priors.contact import CoulombErrorPrior, SlidingFrictionPrior, coulomb_keys
 from forcegp.forces.priors.inertial import InertialPrior, PayloadPrior
 from forcegp.forces.quantities import States, affine_map
@@ -54,7 +54,8 @@ class RobotParameter:
     Attributes:
         name: `slow friction`, `fast friction`, `torque offset`, `torque scale`, `torque delay`, `drive
             inertia`, a change of a link or a payload, such as `link mass·x`, or a term of contact friction.
-        of: name of the joint or contact, or `""`. A link is named after the joint that moves it.
+        of: name of the joint, the contact or the recording, or `""`. A link is named after the joint that
+            moves it. A payload of a recording is the difference from that of the first one.
         value, std: value, including that of the robot file, and standard deviation (`None` if unknown).
         unit: SI unit.
         determined: whether the data reduce the standard deviation to less than half that of the prior.
@@ -158,6 +159,12 @@ def _of_robot(
     links = (inertial_parameters(each.mass, each.com, each.inertia) for each in (robot, file))
     change = torch.sub(*links).tolist()
     for prior in posterior.priors:
+        for recording in prior.recordings if isinstance(prior, PerRecording) else ():
+            for name, word in zip(PARAMETER_NAMES, MOMENTS, strict=True):
+                start = f"{prior.name}.{name}_{recording} of "
+                p = next((p for key, p in learned.items() if key.startswith(start)), None)
+                if p is not None:
+                    yield RobotParameter(f"payload {word}", recording, p.value, p.std, p.unit, p.determined)
         if not isinstance(prior, DrivePrior | InertialPrior | PayloadPrior):
             continue
         kind = "payload" if isinstance(prior, PayloadPrior) else "link"

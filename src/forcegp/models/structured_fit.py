@@ -32,7 +32,14 @@ from forcegp.forces.priors.base import ForcePrior
 from forcegp.forces.priors.constants import PerRecording
 from forcegp.forces.priors.inertial import InertialPrior
 from forcegp.forces.priors.memory import bristles
-from forcegp.forces.problem import Problem, forces_and_constant, is_sparse, lost_by_inducing, typical
+from forcegp.forces.problem import (
+    Problem,
+    forces_and_constant,
+    is_sparse,
+    lost_by_inducing,
+    of_unknown_recording,
+    typical,
+)
 from forcegp.forces.quantities import (
     AffineMap,
     FlatStates,
@@ -324,7 +331,8 @@ class StructuredFit(FittedModel):
         if functions is not None and functions < 1:
             raise ModelError("at least one function must be drawn", expected="1 or more", got=functions)
         tensors = {**self.hyperparameters, **self._region}
-        parts = self.system, self.posterior, tensors, self.noise, self.torque_std
+        posterior = of_unknown_recording(self.problem, self.hyperparameters, self.posterior)
+        parts = self.system, posterior, tensors, self.noise, self.torque_std
         learned, std = self.hyperparameters.get(TORQUE_NOISE), self.problem.torque_std
         std = learned.exp() if learned is not None else 0.0 if std is None else std
         variance = torch.zeros_like(self.system.robot.mass) + std**2

@@ -128,17 +128,21 @@ class OffsetPrior(JointTerm):
         return {name: value + log_scale for name, value in initial.items()}
 
 
-def shares(recordings: Sequence[str], numbers: Tensor | None) -> Sequence[Tensor | float]:
+def shares(
+    recordings: Sequence[str], numbers: Tensor | None, reference: str | None = None
+) -> Sequence[Tensor | float]:
     """Return for each recording whether it is that of each state, and whether none of them is.
 
     Args:
         recordings: names of the recordings.
         numbers: numbers of the recordings of the states `(n, 1)`, or `None` if they are unknown.
+        reference: name of a further recording, in which all shares are zero.
     """
     if numbers is None:
         return [*(0.0 for _ in recordings), 1.0]
-    matches = [(numbers == recording_number(name)).double() for name in recordings]
-    return [*matches, 1.0 - sum(matches)]
+    known = recordings if reference is None else (*recordings, reference)
+    matches = [(numbers == recording_number(name)).double() for name in known]
+    return [*matches[: len(recordings)], 1.0 - sum(matches)]
 
 
 @dataclass(frozen=True)
@@ -152,6 +156,10 @@ class PerRecording(ForcePrior):
     Args:
         prior: prior on the force in each recording; it also provides the names of the hyperparameters.
         recordings: names of the recordings, as in `Dataset.recordings`.
+        reference: name of a further recording, in which the constants are zero. Those of the others are then
+            differences from it.
+        spread: standard deviations of the constants of each recording over blocks of the log [SI units], if
+            they were identified together with the inertia.
 
     Example:
         >>> import forcegp
@@ -165,13 +173,16 @@ class PerRecording(ForcePrior):
 
     prior: ForcePrior
     recordings: tuple[str, ...]
+    reference: str | None = None
+    spread: tuple[tuple[float, ...], ...] = ()
     name: str = field(init=False)
     kernel: Kernel = field(init=False)
     target: str = field(init=False)
 
     def __post_init__(self) -> None:
-        if not self.recordings or len(set(self.recordings)) < len(self.recordings):
-            raise ModelError("recordings need distinct names", expected="one or more", got=self.recordings)
+        names = self.recordings if self.reference is None else (self.reference, *self.recordings)
+        if not self.recordings or len(set(names)) < len(names):
+            raise ModelError("recordings need distinct names", expected="one or more", got=names)
         if not isinstance(self.prior.kernel, Constant):
             raise ModelError(
                 f"force prior {self.prior.name!r} is not a prior on constants",
@@ -191,7 +202,7 @@ class PerRecording(ForcePrior):
 
     def operator(self, system: ConstrainedSystem, at: States) -> Tensor:
         E = self.prior.operator(system, at)
-        each = shares(self.recordings, at.recording)
+        each = shares(self.recordings, at.recording, self.reference)
         mine = torch.cat([torch.as_tensor(x).to(E).expand(len(E), 1) for x in each], dim=-1)
         return (E[..., None] * mine[:, None, None]).flatten(2)
 

@@ -271,6 +271,8 @@ class PayloadPrior(ConstantForcePrior):
         known: mass [kg] and first moment [kg m] of the payload with which the acceleration is computed.
         measured: whether to use the measured acceleration, if available. The force is then exact for any
             payload, but noise biases the estimate towards zero if the accelerations are small.
+        rigid: whether the payload also has moments of inertia, as a rigid body. For a point mass at 0.1 m,
+            they are as large as those of a wrist.
 
     Raises:
         ModelError: `known` does not consist of a mass and a first moment.
@@ -284,8 +286,11 @@ class PayloadPrior(ConstantForcePrior):
     target: str = JOINT
     known: tuple[float, ...] = ()
     measured: bool = False
+    rigid: bool = False
 
     def __post_init__(self) -> None:
+        if self.rigid and self.kernel == Constant(group=MASS_AND_MOMENT):
+            object.__setattr__(self, "kernel", Constant(group=PER_PAYLOAD))
         if self.known and not (len(self.known) == MASS_AND_MOMENT and self.known[0] > 0.0):
             raise ModelError(
                 f"force prior {self.name!r} has an invalid known payload",
@@ -294,7 +299,7 @@ class PayloadPrior(ConstantForcePrior):
             )
 
     def outputs(self, robot: RobotModel) -> int:
-        return MASS_AND_MOMENT
+        return PER_PAYLOAD if self.rigid else MASS_AND_MOMENT
 
     def operator(self, system: ConstrainedSystem, at: States) -> Tensor:
         qdd = at.qdd
@@ -304,23 +309,24 @@ class PayloadPrior(ConstantForcePrior):
                 eom = system.with_robot(self.loaded(system.robot)).equations(at.q, at.qd, at.active)
             qdd = eom.acceleration(eom.Q_K + at.tau)
         first = PER_PAYLOAD * self.link(system.robot)
-        Y = regressor(system.robot, at.q, at.qd, qdd)[..., first : first + MASS_AND_MOMENT]
+        Y = regressor(system.robot, at.q, at.qd, qdd)[..., first : first + self.outputs(system.robot)]
         return -Y * self.units(at.q)
 
     def around(self, mean: Tensor) -> PayloadPrior:
         """Return the prior linearized at the estimated payload.
 
         Args:
-            mean: mean of the latent constants `(4,)`. If they do not describe a point mass near the link, no
-                payload is assumed.
+            mean: mean of the latent constants `(4,)` or `(10,)`. If they do not describe a point mass near
+                the link, no payload is assumed.
         """
-        mass, *moment = (mean * self.units(mean)).tolist()
+        mass, *moment = (mean * self.units(mean))[:MASS_AND_MOMENT].tolist()
         near = mass > 0.0 and math.hypot(*moment) <= FARTHEST * self.length * mass
         return dataclasses.replace(self, known=(mass, *moment) if near else ())
 
     def units(self, like: Tensor) -> Tensor:
-        """Return the mass and first moment `(4,)` per unit of the latent constants."""
-        return like.new_tensor([self.mass, *3 * [self.mass * self.length]])
+        """Return the mass, first moment and, if rigid, inertia per unit of the latent constants."""
+        moments = 6 * [self.mass * self.length**2] if self.rigid else []
+        return like.new_tensor([self.mass, *3 * [self.mass * self.length], *moments])
 
     def loaded(self, robot: RobotModel) -> RobotModel:
         """Return the robot with the known payload, if any, as a point mass."""

@@ -511,7 +511,7 @@ static void inertial_errors(const double *q, const double *qd, const double *tau
   }
 #endif
 #ifdef PAYLOAD
-  inertial(q, qd, PAYLOAD_MEASURED && qdd ? qdd : e->qdd, PAYLOAD, 4, PAYLOAD_COLUMN, PAYLOAD_UNITS, f);
+  inertial(q, qd, PAYLOAD_MEASURED && qdd ? qdd : e->qdd, PAYLOAD, PAYLOAD_COUNT, PAYLOAD_COLUMN, PAYLOAD_UNITS, f);
 #endif
 #ifdef INERTIAL
   inertial(q, qd, qdd ? qdd : e->qdd, INERTIAL, INERTIAL_COUNT, INERTIAL_COLUMN, INERTIAL_UNITS, f);

@@ -38,7 +38,7 @@ from forcegp.forces.external_wrench import ROWS, WrenchFrame
 from forcegp.forces.priors import contact
 from forcegp.forces.priors.base import ForcePrior
 from forcegp.forces.priors.constants import DrivePrior
-from forcegp.forces.priors.inertial import MASS_AND_MOMENT, InertialPrior, PayloadPrior
+from forcegp.forces.priors.inertial import InertialPrior, PayloadPrior
 from forcegp.forces.priors.joint import TERMS, JointForcePrior
 from forcegp.forces.term import ONE, JointState, JointTerm
 from forcegp.gp import kernels
@@ -423,7 +423,7 @@ class LearnedMotion(Mean):
                 Q = Q + prior.std * (self.tau * f)
             elif isinstance(prior, PayloadPrior):
                 links, units = self.zeros(n, PARAMETERS), prior.units(self.robot.mass).tolist()
-                links[prior.link(self.robot), :MASS_AND_MOMENT] = f * np.array(units)
+                links[prior.link(self.robot), : len(units)] = f * np.array(units)
                 Q = Q - self._inertial_force(links, self.zeros(0))
             elif isinstance(prior, contact.NormalForcePrior):
                 # Aᵀ Lᵀ f: −Lᵀ f is the multiplier of M q̈ = f + Aᵀ λ, A q̈ = 0

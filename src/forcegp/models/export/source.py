@@ -293,7 +293,7 @@ class Writer:
                 self.array(columns, "INERTIAL_COLUMN", "int")
                 self.array(units, "INERTIAL_UNITS")
             if isinstance(part.prior, PayloadPrior):
-                self.lines.append(f"#define PAYLOAD {start}")
+                self.lines += [f"#define PAYLOAD {start}", f"#define PAYLOAD_COUNT {part.components}"]
                 first = PER_PAYLOAD * part.prior.link(robot)
                 self.array(range(first, first + part.components), "PAYLOAD_COLUMN", "int")
                 self.lines.append(f"#define PAYLOAD_MEASURED {int(part.prior.measured)}")
