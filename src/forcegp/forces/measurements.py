@@ -45,6 +45,7 @@ class Measurement:
         recording: `(n,)` number of the recording of each sample; unknown by default.
         tau_std: `(n, nq)` additional standard deviation of each torque [N m, N]; `None` for zero.
         history: `(n, nq, k)` states of bristles, if a prior depends on the past and the log is in time order.
+        qdd: accelerations `(n, nq)` in columns of the inertia; the measured ones by default.
     """
 
     quantity: str
@@ -58,6 +59,7 @@ class Measurement:
     recording: Tensor = None  # pyright: ignore[reportAssignmentType]  # filled in below
     tau_std: Tensor | None = None
     history: Tensor | None = None
+    qdd: Tensor | None = None
 
     def __post_init__(self) -> None:
         if self.segment is None:
@@ -90,7 +92,7 @@ class Measurement:
         kept = self.__dict__.get("_kept")
         if kept is not None and kept[0] is system:
             return kept[1]
-        qdd = self.values if self.quantity == "qdd" else None
+        qdd = self.values if self.quantity == "qdd" and self.qdd is None else self.qdd
         at = states(system, *self.states, qdd=qdd, recording=self.recording[:, None])
         at = at if self.history is None else dataclasses.replace(at, history=self.history)
         if len(self.q) <= KEPT:
@@ -107,7 +109,7 @@ class Measurement:
     def __getitem__(self, rows: Tensor) -> Measurement:
         """Return the values at the given rows."""
         parts = (part[rows] for part in (*self.tensors, self.segment, self.t, self.recording))
-        more = (None if part is None else part[rows] for part in (self.tau_std, self.history))
+        more = (None if part is None else part[rows] for part in (self.tau_std, self.history, self.qdd))
         return Measurement(self.quantity, *parts, *more)
 
 

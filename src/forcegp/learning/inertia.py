@@ -38,6 +38,7 @@ from forcegp.forces.priors.ripple import ripple_of
 from forcegp.forces.problem import Problem, force_posterior, typical
 from forcegp.forces.term import JointState, JointTerm
 from forcegp.gp.features import Block
+from forcegp.gp.kernels import sub
 from forcegp.identification import MASS_SHARE, regressor
 from forcegp.learning.correlation import autocorrelation_time
 from forcegp.learning.inverse_dynamics import (
@@ -510,15 +511,26 @@ def drive_scale(robot: RobotModel, q: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def with_updated_robot(problem: Problem, values: Mapping[str, Tensor]) -> Problem:
-    """Return the problem with the inertial parameters at their posterior mean (one Gauss–Newton step)."""
+def with_updated_robot(
+    problem: Problem, values: Mapping[str, Tensor], robot: RobotModel | None = None
+) -> Problem:
+    """Return the problem with the inertial parameters at their posterior mean (one Gauss–Newton step).
+
+    Args:
+        robot: robot of the file, if the problem has another one already, which is the start of this step.
+    """
     for p, prior in enumerate(problem.priors):
         moves = not prior.is_error and problem.parameters is None
         if isinstance(prior, InertialPrior) and moves:
-            file, posterior = problem.system.robot, force_posterior(problem, values)
+            file, posterior = robot or problem.system.robot, force_posterior(problem, values)
             features = one_row(posterior, problem)
             mean = posterior.latent.latent_mean(p, features[p])[0]
             precision = latent_precision(posterior, features, p, file)
+            if robot is not None:
+                # N(δ̂, P⁻¹) for the prior N(0, Λ⁻¹) of δ − δ₀ is N(δ₀ + δ̂ − P⁻¹ Λ δ₀, P⁻¹) for that of δ.
+                start = prior.difference(file, problem.system.robot)
+                std = prior.kernel.std(sub(values, prior.prefix)).to(mean)
+                mean = start + mean - torch.linalg.solve(precision, start / std**2)
             robot = _moved(file, prior, mean, precision, _log_volume(problem, values))
             # The prior keeps the scale of the parameters in the file, not of the updated ones.
             errors = dataclasses.replace(prior.around(file), is_error=True)

@@ -240,6 +240,11 @@ class Residuals(NamedTuple):
         whole = self.variances(torque, stick) * self.read(torque, stick)[0]
         return whole[:, : self.external.shape[-1]]
 
+    def noise(self, torque: Tensor, stick: Tensor) -> Tensor:
+        """Return the most probable noise C⁻¹ r = r − B S Bᵀ C⁻¹ r `(n, d)` for variances σ² and σ_s²."""
+        force = self.variances(torque, stick) * self.read(torque, stick)[0]
+        return self.r - (self.B @ force[..., None])[..., 0]
+
     def read(self, torque: Tensor, stick: Tensor) -> tuple[Tensor, Tensor]:
         """Return Bᵀ C⁻¹ r `(n, nq + 3 c)` and Bᵀ C⁻¹ B for variances σ² and σ_s² `(nq + c,)`.
 
@@ -277,12 +282,19 @@ def without_components(scales: Scales, priors: Sequence[int], kept: Sequence[boo
 
 def residuals(problem: Problem, values: Mapping[str, Tensor], weights: Tensor, i: int) -> Residuals:
     """Return the residuals of measurement i, given the weights of the basis functions."""
-    m, system, std = problem.training.measurements[i], problem.system, problem.noise_at(values, i)
+    m, system = problem.training.measurements[i], problem.system
     at, process, basis = m.at(system), problem.process_at(values), basis_of(problem, values)
-    z = process.coupled(system, at, affine_map(system, at, m.quantity))
-    rows = process.rows(system, at, z)
-    std, weight = std.expand_as(m.values), problem.training.weights
-    r = (m.values - rows.target - basis.mean(rows, weights)) / std
+    rows = process.rows(system, at, process.coupled(system, at, affine_map(system, at, m.quantity)))
+    r = (m.values - rows.target - basis.mean(rows, weights)) / problem.noise_at(values, i)
+    return residuals_of(problem, values, i, r)
+
+
+def residuals_of(problem: Problem, values: Mapping[str, Tensor], i: int, r: Tensor) -> Residuals:
+    """Return the rows of measurement i with given residuals r `(n, d)`, in units of the noise."""
+    m, system, std = problem.training.measurements[i], problem.system, problem.noise_at(values, i)
+    at, weight = m.at(system), problem.training.weights
+    z = problem.process_at(values).coupled(system, at, affine_map(system, at, m.quantity))
+    std = std.expand_as(m.values)
     tips = learned_tips(system, values)
     operators = (z.B_z @ tip_operator(system, at, name) for name in tips)
     B = torch.cat([z.B_Q, *operators], dim=-1) / std[..., None]

@@ -113,6 +113,13 @@ class InertialPrior(ConstantForcePrior):
         parts = [self.mass * m, (self.length * m).expand(-1, 3), self.inertia * products]
         return torch.cat([torch.cat(parts, dim=-1).flatten().detach(), m.new_tensor(self.drives)])
 
+    def difference(self, robot: RobotModel, other: RobotModel) -> Tensor:
+        """Return the components δ of another robot; 0 where S is zero."""
+        links = [inertial_parameters(x.mass, x.com, x.inertia).flatten() for x in (robot, other)]
+        change = [links[1] - links[0], *([other.armature - robot.armature] if self.drives else [])]
+        scale = self.scale(robot)
+        return torch.where(scale > 0.0, torch.cat(change) / scale.clamp(min=1e-300), 0.0)
+
     def curvature(self, robot: RobotModel, weight: float | None = None) -> Tensor:
         """Return the second derivative of the divergence in `updated` with respect to δ, `(10 nq, 10 nq)`.
 
