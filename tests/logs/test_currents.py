@@ -96,6 +96,11 @@ def test_torque_constants_are_learned_where_links_fix_them(fit: StructuredFit, f
     known = forcegp.read_log(folder / "train.npz", fit.specified.robot, mapping("torque_constant_std = 0.0"))
     assert known.header.torque_scale_std is None
     named = {p.of: p.value for p in fit.robot_parameters() if p.name == "torque scale" and p.determined}
+    found = {p.of: p for p in fit.robot_parameters() if p.name == "torque constant"}
+    for joint, true in zip("ab", CONSTANTS, strict=False):
+        one = found[joint]
+        assert one.determined and one.unit == "N m/A" and abs(one.value - true) < 2.0 * (one.std or 0.0)
+    assert not found["c"].determined
     assert named == {joint: 1.0 + own[f"drives.scale of {joint}"].value for joint in "ab"}
 
 

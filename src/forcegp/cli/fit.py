@@ -107,7 +107,15 @@ CLEAR = 2.0
 """Number of standard deviations from zero beyond which a parameter is listed."""
 LISTED = 3
 """Maximum number of values in a list. The others are counted."""
-GROUPS = ("torque scale", "torque delay", "torque offset", "drive inertia", "link", "payload")
+GROUPS = (
+    "torque constant",
+    "torque scale",
+    "torque delay",
+    "torque offset",
+    "drive inertia",
+    "link",
+    "payload",
+)
 """First words of the parameters of joints and links that are listed together."""
 FRICTION = ("slow friction", "fast friction")
 UNITS = {"revolute": "friction and noise in N m at speeds in rad/s", "prismatic": "N at m/s if sliding"}
@@ -170,6 +178,8 @@ def _summary(
     others = [p for p in parameters if p.name not in FRICTION]
     names = dict.fromkeys((*GROUPS, *(p.name for p in others if not p.name.startswith(GROUPS))))
     groups = {group: [p for p in others if p.name.startswith(group)] for group in names}
+    if groups["torque constant"]:
+        del groups["torque scale"]
     short = learned.system.robot.joint_names
     short = dict(zip(short, _short(short), strict=True))
     listed = {group: _listed(members, short) for group, members in groups.items() if members}

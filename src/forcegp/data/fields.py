@@ -40,6 +40,7 @@ class DataHeader(Header):
         stick_speeds: speed below which a contact sticks [m/s], keyed by contact. Other contacts always slide.
         torque_scale_std: relative standard deviation of the scale of each torque, if torques are not measured
             but follow from commands or currents with nominal constants.
+        torque_constants: nominal torque of each joint per current [N m/A, N/A], if currents are logged.
         servo_stiffness, servo_damping: nominal k_p and k_d of each servo [N m/rad, N m s/rad], if torques
             follow from the commanded positions `extras["command"]`.
         recordings: hash of the log of each recording, keyed by name; empty if the log is unknown.
@@ -63,6 +64,7 @@ class DataHeader(Header):
     unmeasured_torques: tuple[str, ...] = ()
     stick_speeds: dict[str, PositiveFloat] = Field(default_factory=dict)
     torque_scale_std: PositiveFloat | None = None
+    torque_constants: tuple[PositiveFloat, ...] = ()
     servo_stiffness: tuple[PositiveFloat, ...] = ()
     servo_damping: tuple[NonNegativeFloat, ...] = ()
     recordings: dict[str, str] = Field(default_factory=dict)

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from forcegp.forces.measurements import Training
-from forcegp.forces.problem import Problem, force_posterior
+from forcegp.forces.problem import PIECE_SAMPLES, Problem, force_posterior
 from forcegp.forces.quantities import affine_map
 from forcegp.learning.scales import residuals_of, variances
 
@@ -27,15 +27,17 @@ from forcegp.learning.scales import residuals_of, variances
 @torch.no_grad()
 def with_likely_accelerations(problem: Problem, values: Mapping[str, Tensor], training: Training) -> Training:
     """Return the training data with the most probable accelerations under the forces of a learned problem."""
-    posterior, system, measurements = force_posterior(problem, values), problem.system, []
-    whole = dataclasses.replace(problem, training=training)
-    slides, rests = variances(problem, dict(values))
-    for i, m in enumerate(training.measurements):
-        if m.quantity == "qdd":
+    posterior, system, values = force_posterior(problem, values), problem.system, dict(values)
+    slides, rests = variances(problem, values)
+    likely: dict[int, list[Tensor]] = {i: [] for i, q in enumerate(training.quantities) if q == "qdd"}
+    for piece in training.pieces(PIECE_SAMPLES):
+        part = dataclasses.replace(problem, training=piece)
+        for i, each in likely.items():
+            m, std = piece.measurements[i], part.noise_at(values, i)
             at = m.at(system)
-            mean = posterior.read_mean(system, at, affine_map(system, at, "qdd"))
-            std = whole.noise_at(dict(values), i).expand_as(m.values)
-            rows = residuals_of(whole, values, i, (m.values - mean) / std)
-            m = dataclasses.replace(m, qdd=m.values - std * rows.noise(slides, rests))
-        measurements.append(m)
+            r = (m.values - posterior.read_mean(system, at, affine_map(system, at, "qdd"))) / std
+            each.append(m.values - std * residuals_of(part, values, i, r).noise(slides, rests))
+    measurements = list(training.measurements)
+    for i, each in likely.items():
+        measurements[i] = dataclasses.replace(measurements[i], qdd=torch.cat(each))
     return dataclasses.replace(training, measurements=tuple(measurements))

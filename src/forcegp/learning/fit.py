@@ -43,9 +43,9 @@ LEARN_SAMPLES_INDUCING = 400
 """Number of samples for learning hyperparameters by exact inference if the log needs sparse inference."""
 FIRST_POWER = 0.25
 """Exponent of the tempered likelihood before the correlation of the residuals is known."""
-REFINEMENTS = 3
-"""Number of Gauss–Newton steps for given priors on links, after the first. On a simulated biped (G1, Coulomb, seed
-0), five of twelve drives are beyond 2σ after the first one, five after one more, and three after three more."""
+STEPS = 3
+"""Number of Gauss–Newton steps for links after the first one. More change the inertia of a pendulum whose
+accelerations are half noise (`tests/learning/test_accelerations.py`) by less than 0.1 %."""
 RELEARNINGS = 3
 """Maximum number of times that hyperparameters are relearned after updates based on the residuals."""
 
@@ -94,12 +94,11 @@ def learned(
     if spec.noise.learns_torque:
         # Given priors on links move the robot.
         part = with_updated_robot(part, values)
-        moves = columns and part.system is not lesson.problem.system
-        for _ in range(REFINEMENTS if moves else 0):
-            problem = _with_moved_robot(problem, part, values)
-            lesson = _of_columns(spec, problem, search, progress, begin)
+        if columns and part.system is not lesson.problem.system:
+            lesson, part = _with_links(spec, problem, lesson, part, search, progress)
             values = dict(lesson.hyperparameters)
-            part = with_updated_robot(lesson.problem, values, spec.system.robot)
+            training = with_likely_accelerations(part, values, problem.training)
+            problem = dataclasses.replace(problem, training=training)
         # 4. Torque noise of held-out blocks
         if TORQUE_NOISE in search.start:
             values |= calibrated_noise(part, values)
@@ -113,8 +112,35 @@ def learned(
     return dataclasses.replace(lesson, problem=whole, hyperparameters=values, warnings=warnings)
 
 
+def _with_links(
+    spec: Specification,
+    problem: Problem,
+    lesson: Lesson,
+    part: Problem,
+    search: Search,
+    progress: FitProgress | None,
+) -> tuple[Lesson, Problem]:
+    """Return the lesson and the problem with links and drives at their posterior mean.
+
+    Each Gauss–Newton step has the columns of the inertia at the most probable accelerations, since measured
+    ones are noisy (`accelerations.py`). Scales and noise are learned once more with the robot of these steps.
+
+    Args:
+        part: the problem of the lesson after the first step.
+    """
+    for learns in (False, True):
+        if learns:
+            again = _with_moved_robot(problem, part, lesson.hyperparameters)
+            lesson = _of_columns(spec, again, search, progress, None)
+            part = with_updated_robot(lesson.problem, lesson.hyperparameters, spec.system.robot)
+        for _ in range(STEPS):
+            part = _with_moved_robot(lesson.problem, part, lesson.hyperparameters)
+            part = with_updated_robot(part, lesson.hyperparameters, spec.system.robot)
+    return lesson, part
+
+
 def _with_moved_robot(problem: Problem, moved: Problem, values: Mapping[str, Tensor]) -> Problem:
-    """Return the problem with a moved robot, and columns of the inertia at the most probable accelerations."""
+    """Return the problem with the robot and the most probable accelerations of another one."""
     robot = problem.system.robot
     priors = [x.around(robot) if isinstance(x, InertialPrior) else x for x in problem.priors]
     training = with_likely_accelerations(moved, values, problem.training)

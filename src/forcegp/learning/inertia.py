@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import scipy
@@ -30,12 +30,11 @@ from torch import Tensor
 from forcegp.constraints import ConstrainedSystem
 from forcegp.dynamics import mass_matrix
 from forcegp.forces.measurements import Training
-from forcegp.forces.noise import TORQUE_NOISE
 from forcegp.forces.posterior import ForcePosterior
 from forcegp.forces.priors.base import ForceMean
 from forcegp.forces.priors.inertial import InertialPrior
 from forcegp.forces.priors.ripple import ripple_of
-from forcegp.forces.problem import Problem, force_posterior, typical
+from forcegp.forces.problem import Problem, force_posterior
 from forcegp.forces.term import JointState, JointTerm
 from forcegp.gp.features import Block
 from forcegp.gp.kernels import sub
@@ -390,8 +389,6 @@ STATED = 0.25 / MASS_SHARE**2
 """Weight γ of this divergence. That of a mass (1 + s) m is 4 γ (s − log (1 + s)) ≈ 2 γ s², so `MASS_SHARE` is
 the standard deviation of s. With γ = 0.01 instead, acceleration errors on held-out blocks of six logs of
 five real arms are 1.36 times as large in the geometric mean, and torque errors the same within 1 %."""
-VOLUME_STATES = 100
-"""Number of states over which log |M| or the noise volume is averaged."""
 IDENTIFIED = "identified inertia replaces that of the robot file, since it predicts held-out torques better"
 UNDETERMINED = 0.5
 """Standard deviation of a scale, over the stated one, from which on the torque is the nominal one."""
@@ -531,7 +528,7 @@ def with_updated_robot(
                 start = prior.difference(file, problem.system.robot)
                 std = prior.kernel.std(sub(values, prior.prefix)).to(mean)
                 mean = start + mean - torch.linalg.solve(precision, start / std**2)
-            robot = _moved(file, prior, mean, precision, _log_volume(problem, values))
+            robot = _moved(file, prior, mean, precision)
             # The prior keeps the scale of the parameters in the file, not of the updated ones.
             errors = dataclasses.replace(prior.around(file), is_error=True)
             moved = problem.without_priors([prior.name]).with_priors([errors], problem)
@@ -544,13 +541,12 @@ def _moved(
     prior: InertialPrior,
     mean: Tensor,
     precision: Tensor,
-    log_volume: Callable[[RobotModel], Tensor] | None,
 ) -> RobotModel:
     """Return the robot with physically consistent links and then, given these, nonnegative drive inertia."""
     count = len(mean) - len(prior.drives)
     links, drives = torch.arange(count), torch.arange(count, len(mean))
     moved, delta = prior.updated(
-        robot, mean[links], _marginal(precision, links, drives), log_volume, STATED if prior.drives else None
+        robot, mean[links], _marginal(precision, links, drives), STATED if prior.drives else None
     )
     if not prior.drives:
         return moved
@@ -563,38 +559,6 @@ def _moved(
     bounds = lower.cpu().numpy(), math.inf
     u = scipy.optimize.lsq_linear(L.mT.cpu().numpy(), right.cpu().numpy(), bounds, method="bvls").x
     return moved.replace(armature=(robot.armature + size * torch.from_numpy(u).to(size)).clamp(min=0.0))
-
-
-def _log_volume(problem: Problem, values: Mapping[str, Tensor]) -> Callable[[RobotModel], Tensor] | None:
-    """Return robot ↦ κ Σ_i log |M (Σ_τ + M Σ_q̈ Mᵀ)^−½| over the samples in free motion, `None` without any.
-
-    This term converts the density of the torque error to that of the acceleration error. Without it, a robot
-    with almost no inertia would best explain small torques, whatever the resulting accelerations.
-    """
-    terms = []
-    std = problem.system.robot.mass.new_zeros(problem.system.robot.nq)
-    if TORQUE_NOISE in values:
-        std = values[TORQUE_NOISE].exp()
-    elif problem.torque_std is not None:
-        std = problem.torque_std
-    for i in (i for i, quantity in enumerate(problem.training.quantities) if quantity == "qdd"):
-        m = problem.training.measurements[i]
-        free = (~m.active.any(-1)).nonzero()[:, 0]
-        if not len(free):
-            continue
-        q = m.q[free[torch.linspace(0, len(free) - 1, min(VOLUME_STATES, len(free))).round().long()]]
-        spread = typical(problem.noise_at(values, i)).detach() ** 2
-        terms.append((q, problem.power * len(free) / len(q), spread))
-
-    def volume(robot: RobotModel) -> Tensor:
-        total = robot.mass.new_zeros(())
-        for q, weight, spread in terms:
-            M = mass_matrix(robot, q)
-            C = torch.diag(std**2) + (M * spread) @ M.mT
-            total = total + weight * (torch.logdet(M) - 0.5 * torch.logdet(C)).sum()
-        return total
-
-    return volume if terms else None
 
 
 def one_row(posterior: ForcePosterior, problem: Problem) -> list[dict[str, Tensor]]:

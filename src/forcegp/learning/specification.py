@@ -111,7 +111,8 @@ class Specification:
         priors = (*priors, *_of_recordings(observations, priors, self.system.robot))
         scale = max(o.data.header.torque_scale_std or 0.0 for o in observations)
         if scale and not any(isinstance(prior, DrivePrior) for prior in priors):
-            priors = (*priors, DrivePrior(std=scale))
+            nominal = {o.data.header.torque_constants for o in observations}
+            priors = (*priors, DrivePrior(std=scale, nominal=nominal.pop() if len(nominal) == 1 else ()))
         if self.inference.method != "exact" and not any(prior.remainder for prior in priors):
             priors = (*priors, ResidualPrior())
         noise, inertia = self.noise.for_priors(priors), self.inertia or "auto"

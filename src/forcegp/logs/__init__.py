@@ -26,7 +26,14 @@ from forcegp.logs.compensated import restore
 from forcegp.logs.contact import Evidence, detect, per_contact
 from forcegp.logs.from_contact import derive_joints, stick_speeds
 from forcegp.logs.gather import gather
-from forcegp.logs.mapping import Mapping, default_mapping, load_mapping, parse_mapping, scale_std
+from forcegp.logs.mapping import (
+    Mapping,
+    default_mapping,
+    load_mapping,
+    parse_mapping,
+    scale_std,
+    torque_constants,
+)
 from forcegp.logs.modelled import find_modelled, without_noise
 from forcegp.logs.motion import check_base, check_clock, find_jumps
 from forcegp.logs.servo import damp, servo_fields, spring_torque
@@ -243,6 +250,7 @@ def _dataset(
         unmeasured_torques=mapping.torque.unmeasured,
         stick_speeds=sticking,
         torque_scale_std=scale_std(mapping),
+        torque_constants=torque_constants(mapping, robot.joint_names),
         **({} if servo is None else servo_fields(mapping, robot.joint_names)),
         recordings=names,
         joint_names=robot.joint_names,

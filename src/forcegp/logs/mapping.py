@@ -584,6 +584,17 @@ def scale_std(mapping: Mapping) -> float | None:
     return torque.torque_constant_std or None if torque is not None and torque.torque_constant else None
 
 
+def torque_constants(mapping: Mapping, joints: Sequence[str]) -> tuple[float, ...]:
+    """Return the nominal torque of each joint per current [N m/A, N/A]; empty if currents are not logged."""
+    torque = mapping.sections.torque
+    measured = () if torque is None else mapping.measured("torque", joints)
+    if torque is None or torque.torque_constant is None or len(measured) < len(joints):
+        return ()
+    constants = mapping.per_joint("torque", "torque_constant", measured)
+    gears = mapping.per_joint("torque", "gear_ratio", measured) if torque.side == "motor" else 1.0
+    return tuple((constants * gears).tolist())
+
+
 def default_mapping(path: str | Path, system: ConstrainedSystem) -> Mapping:
     """Return the mapping for a log with unambiguous column names; raise `MappingError` otherwise."""
     table, robot = read(path, rows=ROWS), system.robot

@@ -52,8 +52,9 @@ class RobotParameter:
     """A learned parameter of a robot or a contact.
 
     Attributes:
-        name: `slow friction`, `fast friction`, `torque offset`, `torque scale`, `torque delay`, `drive
-            inertia`, a change of a link or a payload, such as `link mass·x`, or a term of contact friction.
+        name: `slow friction`, `fast friction`, `torque offset`, `torque scale`, `torque constant`, `torque
+            delay`, `drive inertia`, a change of a link or a payload, such as `link mass·x`, or a term of
+            contact friction.
         of: name of the joint, the contact or the recording, or `""`. A link is named after the joint that
             moves it. A payload of a recording is the difference from that of the first one.
         value, std: value, including that of the robot file, and standard deviation (`None` if unknown).
@@ -181,6 +182,9 @@ def _of_robot(
                     # Scales that are not identified stay nominal.
                     determined &= name != "scale" or p.value != 0.0
                     yield RobotParameter(words, joint, value, p.std, p.unit, determined)
+                if p is not None and isinstance(prior, DrivePrior) and prior.nominal:
+                    k, unit = prior.nominal[j], ("N m/A", "N/A")[robot.joint_types[j] != "revolute"]
+                    yield RobotParameter("torque constant", joint, k * value, k * p.std, unit, determined)
         if isinstance(prior, InertialPrior) and prior.delay:
             yield RobotParameter("torque delay", "", prior.delay, None, "s", True)
 

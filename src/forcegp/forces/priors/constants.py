@@ -36,6 +36,7 @@ class DrivePrior(ConstantForcePrior):
         spread: standard deviation of each s δ_i over blocks of the log, if it was identified together with
             the inertia.
         is_error: whether the robot has the most probable scales, so that their errors have zero mean.
+        nominal: nominal torque of each joint per current [N m/A, N/A], if known.
         kernel: covariance of δ.
         name: prefix of the hyperparameters.
 
@@ -56,6 +57,7 @@ class DrivePrior(ConstantForcePrior):
     target: str = JOINT
     spread: tuple[float, ...] = ()
     is_error: bool = False
+    nominal: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         if not self.std > 0.0:

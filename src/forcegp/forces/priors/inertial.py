@@ -13,7 +13,6 @@ from __future__ import annotations
 import dataclasses
 import math
 import warnings
-from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import torch
@@ -138,13 +137,12 @@ class InertialPrior(ConstantForcePrior):
         robot: RobotModel,
         mean: Tensor,
         precision: Tensor,
-        log_volume: Callable[[RobotModel], Tensor] | None = None,
         weight: float | None = None,
     ) -> tuple[RobotModel, Tensor]:
         """Return the most probable physically consistent robot given δ ~ N(mean, precision⁻¹).
 
-        The objective ½ (δ − mean)ᵀ precision (δ − mean) + γ Σ_k [tr(J₀⁻¹J) − log |J₀⁻¹J| − 4] − V(δ) is
-        minimised over the pseudo-inertias J > 0 of the links, in which it is convex if V = 0. If the log does
+        The convex objective ½ (δ − mean)ᵀ precision (δ − mean) + γ Σ_k [tr(J₀⁻¹J) − log |J₀⁻¹J| − 4] is
+        minimised over the pseudo-inertias J > 0 of the links. If the log does
         not determine the inertia of a link, the second term (the divergence of Lee, Wensing and Park, 2019,
         with weight γ = 0.01 by default) keeps this inertia from vanishing.
 
@@ -152,8 +150,6 @@ class InertialPrior(ConstantForcePrior):
             robot: robot with the parameters π₀.
             mean: mean of δ `(10 nq,)`.
             precision: precision of δ `(10 nq, 10 nq)`.
-            log_volume: function V that converts the density of torques to that of accelerations; zero by
-                default.
             weight: weight γ of the divergence.
 
         Returns:
@@ -172,15 +168,7 @@ class InertialPrior(ConstantForcePrior):
             parts = zip(("mass", "com", "inertia"), from_pseudo_inertia(J.to(mean)), strict=True)
             return robot.replace(**{name: getattr(robot, name).index_put((links,), x) for name, x in parts})
 
-        def volume(x: Tensor) -> tuple[float, Tensor]:
-            if log_volume is None:
-                return 0.0, torch.zeros_like(x)
-            with torch.enable_grad():
-                x = x.detach().requires_grad_()
-                V = log_volume(robot_of(J0[links] + _change(x, E)))
-                return float(V.detach()), torch.autograd.grad(V, x)[0]
-
-        x, J = _most_probable(P, r, J0[links], E, volume, DIVERGENCE if weight is None else weight)
+        x, J = _most_probable(P, r, J0[links], E, DIVERGENCE if weight is None else weight)
         return robot_of(J), torch.zeros_like(mean).index_put((index,), x.to(mean))
 
 
@@ -194,10 +182,9 @@ def _most_probable(
     r: Tensor,
     J0: Tensor,
     E: Tensor,
-    volume: Callable[[Tensor], tuple[float, Tensor]],
     least: float,
 ) -> tuple[Tensor, Tensor]:
-    """Minimise ½ xᵀP x − rᵀx + γ Σ_k [tr(J₀⁻¹J) − log |J|] − V(x) over J = J₀ + Σ_p x_p E_p > 0.
+    """Minimise ½ xᵀP x − rᵀx + γ Σ_k [tr(J₀⁻¹J) − log |J|] over J = J₀ + Σ_p x_p E_p > 0.
 
     The logarithm is the barrier of an interior-point method: γ decreases from a value at which x = 0 is close
     to the minimum. Steps of Newton's method are J ← L (1 + Y) Lᵀ with J = L Lᵀ, since the barrier has unit
@@ -210,10 +197,10 @@ def _most_probable(
     coordinates, inverse = torch.linalg.inv(E[..., row, column].mT), torch.linalg.inv(J0)
     x, J, weight = torch.zeros_like(r), J0, 0.0
     for _ in range(MOST_STEPS):
-        L, (V, rising) = torch.linalg.cholesky(J), volume(x)
+        L = torch.linalg.cholesky(J)
         moved = L[:, None] @ D @ L[:, None].mT
         T = torch.block_diag(*(coordinates @ moved[..., row, column].mT))
-        slope, bend = T.mT @ (P @ x - r - rising), T.mT @ P @ T
+        slope, bend = T.mT @ (P @ x - r), T.mT @ P @ T
         weight = weight or max(least, float(slope.norm()))
         divergence = (inverse[:, None] * moved - D * one).sum((-1, -2)).flatten()
         bend = bend + weight * torch.eye(len(r)).to(r)
@@ -231,8 +218,7 @@ def _most_probable(
             # The divergence changes by tr(J₀⁻¹ΔJ) − log |1 + s Y|.
             barrier = share * (divergence @ y + stretch.sum()) - torch.log1p(share * stretch).sum()
             quadratic = share * step @ (P @ (x + 0.5 * share * step) - r)
-            change = float(quadratic + weight * barrier) + V - volume(x + share * step)[0]
-            if change <= -ENOUGH * share * decrement:
+            if float(quadratic + weight * barrier) <= -ENOUGH * share * decrement:
                 break
             share *= 0.5
         x, J = x + share * step, L @ (one + share * Y) @ L.mT
