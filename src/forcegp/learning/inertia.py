@@ -526,8 +526,8 @@ def with_updated_robot(
             if robot is not None:
                 # N(δ̂, P⁻¹) for the prior N(0, Λ⁻¹) of δ − δ₀ is N(δ₀ + δ̂ − P⁻¹ Λ δ₀, P⁻¹) for that of δ.
                 start = prior.difference(file, problem.system.robot)
-                std = prior.kernel.std(sub(values, prior.prefix)).to(mean)
-                mean = start + mean - torch.linalg.solve(precision, start / std**2)
+                variance = prior.kernel.variance(sub(values, prior.prefix))(features[p])[:, 0].to(mean)
+                mean = start + mean - torch.linalg.solve(precision, start / variance)
             robot = _moved(file, prior, mean, precision)
             # The prior keeps the scale of the parameters in the file, not of the updated ones.
             errors = dataclasses.replace(prior.around(file), is_error=True)

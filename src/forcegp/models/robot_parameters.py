@@ -182,9 +182,9 @@ def _of_robot(
                     # Scales that are not identified stay nominal.
                     determined &= name != "scale" or p.value != 0.0
                     yield RobotParameter(words, joint, value, p.std, p.unit, determined)
-                if p is not None and isinstance(prior, DrivePrior) and prior.nominal:
-                    k, unit = prior.nominal[j], ("N m/A", "N/A")[robot.joint_types[j] != "revolute"]
-                    yield RobotParameter("torque constant", joint, k * value, k * p.std, unit, determined)
+                    if isinstance(prior, DrivePrior) and prior.nominal:
+                        k, unit = prior.nominal[j], ("N m/A", "N/A")[robot.joint_types[j] != "revolute"]
+                        yield RobotParameter("torque constant", joint, k * value, k * p.std, unit, determined)
         if isinstance(prior, InertialPrior) and prior.delay:
             yield RobotParameter("torque delay", "", prior.delay, None, "s", True)
 

@@ -21,7 +21,7 @@ from forcegp.files import Record
 from forcegp.forces.measurements import Measurement, Training, plain
 from forcegp.forces.noise import Noise
 from forcegp.forces.posterior import ForcePosterior
-from forcegp.forces.priors.base import ANALYTICAL
+from forcegp.forces.priors.base import ANALYTICAL, ForcePrior
 from forcegp.forces.problem import Problem, analytical_parameters, kernel_parameters
 from forcegp.forces.quantities import states
 from forcegp.gp import kernels
