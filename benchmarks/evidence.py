@@ -173,7 +173,7 @@ def simulated(of: dict[str, Any]) -> str:
         ],
         *(
             [
-                f"feet of a quadruped, {friction} friction",
+                f"feet of legged robots, {friction} friction",
                 "force ÷ −J⁻ᵀτ; ÷ equations of motion; ÷ the same, identified",
                 feet([x for x in legs if x["friction"] == friction]),
                 "legs",
