@@ -173,12 +173,12 @@ def simulated(of: dict[str, Any]) -> str:
         ],
         *(
             [
-                f"feet of legged robots, {friction} friction",
-                "force ÷ −J⁻ᵀτ; ÷ equations of motion; ÷ the same, identified",
+                f"feet, {friction} friction",
+                "″" if k else "force ÷ −J⁻ᵀτ; ÷ equations of motion; ÷ the same, identified",
                 feet([x for x in legs if x["friction"] == friction]),
                 "legs",
             ]
-            for friction in dict.fromkeys(x["friction"] for x in legs)
+            for k, friction in enumerate(dict.fromkeys(x["friction"] for x in legs))
         ),
         [
             "servos, positions and commands only",
