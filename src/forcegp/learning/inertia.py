@@ -12,8 +12,8 @@ leads the motion by half of it. Milliseconds bias the inertia of a light joint a
 along periodic motions, viscous friction. The delay is therefore an additional unknown, and if links are
 identified, the model is trained on torques shifted by it.
 
-If an `InertialPrior` is given, the inertial parameters of the robot are set to their posterior mean in one
-physically consistent Gauss–Newton step.
+If an `InertialPrior` is given, the inertial parameters of the robot are set to their posterior mean in
+physically consistent Gauss–Newton steps, with columns at the most probable accelerations (`accelerations.py`).
 """
 
 from __future__ import annotations
