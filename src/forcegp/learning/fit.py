@@ -132,10 +132,10 @@ def _with_links(
         if learns:
             again = _with_moved_robot(problem, part, lesson.hyperparameters)
             lesson = _of_columns(spec, again, search, progress, None)
-            part = with_updated_robot(lesson.problem, lesson.hyperparameters, spec.system.robot)
+            part = with_updated_robot(lesson.problem, lesson.hyperparameters, problem.system.robot)
         for _ in range(STEPS):
             part = _with_moved_robot(lesson.problem, part, lesson.hyperparameters)
-            part = with_updated_robot(part, lesson.hyperparameters, spec.system.robot)
+            part = with_updated_robot(part, lesson.hyperparameters, problem.system.robot)
     return lesson, part
 
 

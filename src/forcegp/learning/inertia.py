@@ -13,7 +13,8 @@ along periodic motions, viscous friction. The delay is therefore an additional u
 identified, the model is trained on torques shifted by it.
 
 If an `InertialPrior` is given, the inertial parameters of the robot are set to their posterior mean in
-physically consistent Gauss–Newton steps, with columns at the most probable accelerations (`accelerations.py`).
+physically consistent Gauss–Newton steps. Columns are at the most probable accelerations
+(`accelerations.py`).
 """
 
 from __future__ import annotations
