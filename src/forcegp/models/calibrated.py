@@ -136,8 +136,8 @@ def calibrated(
     Args:
         fit: a fit with an analytical mean.
         draws: number of function samples from which standard deviations are computed.
-        seed: random seed for these samples, whose covariance weights the links that are made physical, and for
-            the poses over which friction is averaged. Estimates depend on both within their bars.
+        seed: random seed for these samples, whose covariance weights the links that are made physical, and
+            for the poses over which friction is averaged. Estimates depend on both within their bars.
         gain_std: relative standard deviation of the torque sensors' gains, which no log determines. The
             resulting errors of the identified inertia are included in its standard deviations.
         mjcf: whether friction has the form of MJCF, with polynomial damping and memory, or else of URDF.
