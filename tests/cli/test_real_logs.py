@@ -63,4 +63,8 @@ def test_a_published_log_is_fitted_by_a_command(tmp_path: Path) -> None:
     run("import", log, "--robot", robot, "-m", mapping, "-o", out)
     told = run("fit", "--robot", robot, "-d", out, "-o", tmp_path / "model")
     # What the fit warns of is printed once, and no list as Python writes it.
-    assert "('" not in told and "slow friction" in told and (tmp_path / "model.safetensors").is_file()
+    assert (
+        "('" not in told
+        and "friction [N m], slow and fast motion" in told
+        and (tmp_path / "model.safetensors").is_file()
+    )
