@@ -255,11 +255,11 @@ def _short(names: Sequence[str]) -> list[str]:
 
 def _accuracy(learned: StructuredFit, data: forcegp.Dataset | forcegp.StreamedDataset) -> Iterator[str]:
     """Yield the errors in open loop on the training motion, and the standard deviation of normal forces."""
-    from forcegp.evaluation import open_loop
+    motion = None
+    if not isinstance(data, forcegp.StreamedDataset) and data.header.ordered:
+        from forcegp.evaluation import open_loop
 
-    motion = (
-        None if isinstance(data, forcegp.StreamedDataset) else open_loop(learned, learned.specified, data)
-    )
+        motion = open_loop(learned, learned.specified, data)
     if motion is not None and OPEN_LOOP in motion.horizons:
         k = motion.horizons.index(OPEN_LOOP)
         model, file = (_share(shares[k]) for shares in (motion.model, motion.robot_file))
