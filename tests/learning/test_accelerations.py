@@ -43,5 +43,5 @@ def found(system: forcegp.ConstrainedSystem, data: forcegp.Dataset) -> Tensor:
 def test_noisy_accelerations_do_not_attenuate_inertia(monkeypatch) -> None:
     system, data = noisy()
     assert ((found(system, data) / DRIVES - 1.0).abs() < 0.1).all()
-    monkeypatch.setattr(learning.LikelyAccelerations, "of_training", lambda _, training: training)
+    monkeypatch.setattr(learning, "with_likely_accelerations", lambda problem, values, training: training)
     assert (found(system, data) < 0.75 * DRIVES).all()

@@ -129,14 +129,6 @@ def client() -> Iterator[Any]:
         yield client
 
 
-@pytest.mark.slow
-def test_two_workers_know_the_most_probable_accelerations(client: Any, files: StreamedDataset) -> None:
-    priors = [JointFrictionPrior(), InertialPrior()]
-    measured = forcegp.StructuredGP(two_contacts(), "analytical", priors, noise=0.1)
-    alone, shared = (measured.fit(files, options=SHORT, client=x) for x in (None, client))
-    torch.testing.assert_close(weights(shared), weights(alone), rtol=1e-9, atol=1e-12)
-
-
 @pytest.mark.parametrize("file_count", [1, 2])
 def test_two_workers_equal_one_process(client: Any, tmp_path: Path, file_count: int) -> None:
     """A file is shared piece by piece, and several files file by file."""

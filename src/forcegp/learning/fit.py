@@ -28,7 +28,7 @@ from forcegp.forces.priors.inertial import InertialPrior
 from forcegp.forces.problem import Problem, is_finite, is_sparse, with_inducing, without_inducing
 from forcegp.gp.exact import require_exact_fits
 from forcegp.gp.optimise import FitProgress, Learned, reported
-from forcegp.learning.accelerations import LikelyAccelerations
+from forcegp.learning.accelerations import with_likely_accelerations
 from forcegp.learning.correlation import residual_times
 from forcegp.learning.held_out import calibrated_noise
 from forcegp.learning.inertia import with_updated_robot
@@ -61,7 +61,6 @@ class Lesson:
         learned_on: number of samples used for learning.
         warnings: warnings about the result.
         worth: log evidence of each group of columns over its absence [nats].
-        likely: the accelerations in columns of the inertia, if they are not the measured ones.
     """
 
     problem: Problem
@@ -70,7 +69,6 @@ class Lesson:
     learned_on: int | None = None
     warnings: tuple[str, ...] = ()
     worth: Mapping[str, float] = field(default_factory=dict)
-    likely: LikelyAccelerations | None = None
 
 
 def learned(
@@ -99,9 +97,6 @@ def learned(
         if columns and part.system is not lesson.problem.system:
             lesson, part = _with_links(spec, problem, lesson, part, search, progress)
             values = dict(lesson.hyperparameters)
-            likely = LikelyAccelerations.of(part, values)
-            lesson = dataclasses.replace(lesson, likely=likely)
-            problem = dataclasses.replace(problem, training=likely.of_training(problem.training))
         # 4. Torque noise of held-out blocks
         if TORQUE_NOISE in search.start:
             values |= calibrated_noise(part, values)
@@ -146,7 +141,7 @@ def _with_moved_robot(problem: Problem, moved: Problem, values: Mapping[str, Ten
     """Return the problem with the robot and the most probable accelerations of another one."""
     robot = problem.system.robot
     priors = [x.around(robot) if isinstance(x, InertialPrior) else x for x in problem.priors]
-    training = LikelyAccelerations.of(moved, values).of_training(problem.training)
+    training = with_likely_accelerations(moved, values, problem.training)
     return dataclasses.replace(problem, system=moved.system, priors=tuple(priors), training=training)
 
 

@@ -31,7 +31,6 @@ from forcegp.forces.problem import PIECE_SAMPLES, Problem, Totals, basis_of, pos
 from forcegp.gp.basis import LatentBasis
 from forcegp.gp.features import Standardization
 from forcegp.gp.optimise import FitProgress
-from forcegp.learning.accelerations import LikelyAccelerations
 from forcegp.learning.correlation import MOST_RESIDUALS, RUNS
 from forcegp.learning.inverse_dynamics import without_delay
 from forcegp.learning.specification import FEWEST_MOVING, REST_SPEED, Specification, at_rest, still_of
@@ -211,7 +210,6 @@ class Pass:
         sample: the sample used for learning.
         client: client of a Dask cluster, or `None`.
         progress: a function called with the number of processed samples, the total number, and NaN.
-        likely: the accelerations in columns of the inertia, if they are not the measured ones.
     """
 
     spec: Specification
@@ -219,7 +217,6 @@ class Pass:
     sample: Sample
     client: Client | None = None
     progress: FitProgress | None = None
-    likely: LikelyAccelerations | None = None
 
     @torch.no_grad()
     def forces(
@@ -233,7 +230,7 @@ class Pass:
         basis, kept = basis_of(problem, hyperparameters), kept_scales(problem.priors, problem.training)
         rows = [torch.arange(0)] * len(problem.training.measurements)
         bare = dataclasses.replace(problem, training=problem.training.of_rows(rows))
-        part = Part(self.spec, bare, dict(hyperparameters), basis, kept, self.sample.moving, self.likely)
+        part = Part(self.spec, bare, dict(hyperparameters), basis, kept, self.sample.moving)
         if self.client is None:
             totals = _in_threads(part.piece, part.pieces(self.log), torch.get_num_threads())
         else:
@@ -257,7 +254,6 @@ class Part:
         basis: the basis functions of all workers.
         scales: input scales, keyed by prior.
         moving: whether samples at rest and outliers are ignored.
-        likely: the accelerations in columns of the inertia, if they are not the measured ones.
     """
 
     spec: Specification
@@ -266,7 +262,6 @@ class Part:
     basis: LatentBasis
     scales: dict[str, Standardization]
     moving: bool
-    likely: LikelyAccelerations | None = None
 
     def pieces(self, log: StreamedDataset, r: int = 0, k: int = 1) -> Iterator[Dataset]:
         """Yield piece r of every k, with the states of bristles if a prior depends on the past."""
@@ -289,9 +284,8 @@ class Part:
             return Totals.zero(self.problem, self.basis)
         noise_std, priors = self.spec.noise.acceleration, self.problem.priors
         rows = training_of(piece, self.spec.system, priors, noise_std, self.scales)
-        rows = without_delay(rows, priors)
-        rows = rows if self.likely is None else self.likely.of_training(rows)
-        return total_over(self.problem, self.hyperparameters, self.basis, rows.pieces(PIECE_SAMPLES))
+        pieces = without_delay(rows, priors).pieces(PIECE_SAMPLES)
+        return total_over(self.problem, self.hyperparameters, self.basis, pieces)
 
     def share(self, share: tuple[StreamedDataset, int, int]) -> Totals:
         """Return the totals over every k-th piece of a log from piece r, on one thread."""

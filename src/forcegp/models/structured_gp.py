@@ -201,7 +201,7 @@ class StructuredGP(Model[StructuredFit]):
         lesson = learned(spec, problem, search, progress, begin, neighbours)
         spec, values, forces = spec.with_priors_of(lesson.problem), lesson.hyperparameters, None
         if sample.log is not None and lesson.problem.inducing is not None:
-            whole = Pass(spec, sample.log, sample, client, progress, lesson.likely)
+            whole = Pass(spec, sample.log, sample, client, progress)
             forces = whole.forces(*lesson.problem.with_coulomb_errors(values))
         warnings = (*excluded(sample.outliers), *doubts, *lesson.warnings)
         fit = conditioned(spec, lesson.problem, values, lesson.learned, warnings, lesson.learned_on, forces)

@@ -142,9 +142,9 @@ class InertialPrior(ConstantForcePrior):
         """Return the most probable physically consistent robot given δ ~ N(mean, precision⁻¹).
 
         The convex objective ½ (δ − mean)ᵀ precision (δ − mean) + γ Σ_k [tr(J₀⁻¹J) − log |J₀⁻¹J| − 4] is
-        minimised over the pseudo-inertias J > 0 of the links. If the log does
-        not determine the inertia of a link, the second term (the divergence of Lee, Wensing and Park, 2019,
-        with weight γ = 0.01 by default) keeps this inertia from vanishing.
+        minimised over the pseudo-inertias J > 0 of the links. If the log does not determine the inertia of a
+        link, the second term (the divergence of Lee, Wensing and Park, 2019, with weight γ = 0.01 by default)
+        keeps this inertia from vanishing.
 
         Args:
             robot: robot with the parameters π₀.
@@ -177,13 +177,7 @@ def _change(x: Tensor, E: Tensor) -> Tensor:
     return torch.einsum("kp,kpij->kij", x.view(-1, PER_LINK), E)
 
 
-def _most_probable(
-    P: Tensor,
-    r: Tensor,
-    J0: Tensor,
-    E: Tensor,
-    least: float,
-) -> tuple[Tensor, Tensor]:
+def _most_probable(P: Tensor, r: Tensor, J0: Tensor, E: Tensor, least: float) -> tuple[Tensor, Tensor]:
     """Minimise ½ xᵀP x − rᵀx + γ Σ_k [tr(J₀⁻¹J) − log |J|] over J = J₀ + Σ_p x_p E_p > 0.
 
     The logarithm is the barrier of an interior-point method: γ decreases from a value at which x = 0 is close
