@@ -36,6 +36,7 @@ from forcegp.learning.noise_learning import left_out, weighted, with_learned_slo
 from forcegp.learning.regression import are_columns, regression, with_acceleration_noise, with_expectations
 from forcegp.learning.search import Search
 from forcegp.learning.specification import Specification
+from forcegp.robot.model import RobotModel
 
 LEARN_SAMPLES = 800
 """Number of samples for learning hyperparameters if all priors have finitely many features."""
@@ -88,15 +89,16 @@ def learned(
     if not search.start:
         return Lesson(prepared(spec, problem, search.held), search.held)
     # 3. Scales of columns and variances of rows, or hyperparameters of kernels
-    columns = is_regression(spec, problem)
-    lesson = (_of_columns if columns else _of_kernels)(spec, problem, search, progress, begin)
+    columns, robot = is_regression(spec, problem), problem.system.robot
+    if columns:
+        moved = _with_links_of_laws(spec, problem, search, progress)
+        lesson = _of_columns(spec, moved, search, progress, begin)
+    else:
+        lesson = _of_kernels(spec, problem, search, progress, begin)
     part, values = lesson.problem, dict(lesson.hyperparameters)
     if spec.noise.learns_torque:
         # Given priors on links move the robot.
-        part = with_updated_robot(part, values)
-        if columns and part.system is not lesson.problem.system:
-            lesson, part = _with_links(spec, problem, lesson, part, search, progress)
-            values = dict(lesson.hyperparameters)
+        part = _with_links(part, values, robot, STEPS if columns else 0)
         # 4. Torque noise of held-out blocks
         if TORQUE_NOISE in search.start:
             values |= calibrated_noise(part, values)
@@ -110,31 +112,35 @@ def learned(
     return dataclasses.replace(lesson, problem=whole, hyperparameters=values, warnings=warnings)
 
 
-def _with_links(
-    spec: Specification,
-    problem: Problem,
-    lesson: Lesson,
-    part: Problem,
-    search: Search,
-    progress: FitProgress | None,
-) -> tuple[Lesson, Problem]:
-    """Return the lesson and the problem with links and drives at their posterior mean.
-
-    Each Gauss–Newton step has the columns of the inertia at the most probable accelerations, since measured
-    ones are noisy (`accelerations.py`). Scales and noise are learned once more with the robot of these steps.
+def _with_links(part: Problem, values: Mapping[str, Tensor], robot: RobotModel, steps: int) -> Problem:
+    """Return a learned problem with links and drives at their posterior mean, if there is a prior on them.
 
     Args:
-        part: the problem of the lesson after the first step.
+        part: the problem, whose robot may be that of earlier steps.
+        values: its hyperparameters.
+        robot: the robot of the file.
+        steps: number of Gauss–Newton steps after the first one, with columns of the inertia at the most
+            probable accelerations, since measured ones are noisy (`accelerations.py`).
     """
-    for learns in (False, True):
-        if learns:
-            again = _with_moved_robot(problem, part, lesson.hyperparameters)
-            lesson = _of_columns(spec, again, search, progress, None)
-            part = with_updated_robot(lesson.problem, lesson.hyperparameters, problem.system.robot)
-        for _ in range(STEPS):
-            part = _with_moved_robot(lesson.problem, part, lesson.hyperparameters)
-            part = with_updated_robot(part, lesson.hyperparameters, problem.system.robot)
-    return lesson, part
+    moved = with_updated_robot(part, values, robot)
+    for _ in range(steps if moved is not part else 0):
+        moved = with_updated_robot(_with_moved_robot(part, moved, values), values, robot)
+    return moved
+
+
+def _with_links_of_laws(
+    spec: Specification, problem: Problem, search: Search, progress: FitProgress | None
+) -> Problem:
+    """Return the problem with the robot that a first fit without a residual force finds, if links may change.
+
+    Noise depends on the inertia, by which the noise of accelerations acts like torques.
+    """
+    if all(prior.is_error or not isinstance(prior, InertialPrior) for prior in problem.priors):
+        return problem
+    laws = problem.without_priors([prior.name for prior in problem.priors if prior.remainder])
+    first = _of_columns(dataclasses.replace(spec, automatic=False), laws, search, progress, None)
+    part, values = first.problem, first.hyperparameters
+    return _with_moved_robot(problem, _with_links(part, values, problem.system.robot, STEPS), values)
 
 
 def _with_moved_robot(problem: Problem, moved: Problem, values: Mapping[str, Tensor]) -> Problem:

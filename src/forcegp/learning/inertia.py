@@ -509,26 +509,25 @@ def drive_scale(robot: RobotModel, q: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def with_updated_robot(
-    problem: Problem, values: Mapping[str, Tensor], robot: RobotModel | None = None
-) -> Problem:
+def with_updated_robot(problem: Problem, values: Mapping[str, Tensor], file: RobotModel) -> Problem:
     """Return the problem with the inertial parameters at their posterior mean (one Gauss–Newton step).
 
     Args:
-        robot: robot of the file, if the problem has another one already, which is the start of this step.
+        problem: the problem, whose robot is the start of this step.
+        values: its hyperparameters.
+        file: the robot of the file, on which the prior is centred.
     """
     for p, prior in enumerate(problem.priors):
         moves = not prior.is_error and problem.parameters is None
         if isinstance(prior, InertialPrior) and moves:
-            file, posterior = robot or problem.system.robot, force_posterior(problem, values)
+            posterior = force_posterior(problem, values)
             features = one_row(posterior, problem)
             mean = posterior.latent.latent_mean(p, features[p])[0]
             precision = latent_precision(posterior, features, p, file)
-            if robot is not None:
-                # N(δ̂, P⁻¹) for the prior N(0, Λ⁻¹) of δ − δ₀ is N(δ₀ + δ̂ − P⁻¹ Λ δ₀, P⁻¹) for that of δ.
-                start = prior.difference(file, problem.system.robot)
-                variance = prior.kernel.variance(sub(values, prior.prefix))(features[p])[:, 0].to(mean)
-                mean = start + mean - torch.linalg.solve(precision, start / variance)
+            # N(δ̂, P⁻¹) for the prior N(0, Λ⁻¹) of δ − δ₀ is N(δ₀ + δ̂ − P⁻¹ Λ δ₀, P⁻¹) for that of δ.
+            start = prior.difference(file, problem.system.robot)
+            variance = prior.kernel.variance(sub(values, prior.prefix))(features[p])[:, 0].to(mean)
+            mean = start + mean - torch.linalg.solve(precision, start / variance)
             robot = _moved(file, prior, mean, precision)
             # The prior keeps the scale of the parameters in the file, not of the updated ones.
             errors = dataclasses.replace(prior.around(file), is_error=True)
