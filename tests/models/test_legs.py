@@ -97,10 +97,13 @@ def test_touch_down_and_lift_off_are_found_in_an_imported_log(monkeypatch: pytes
 
 @pytest.mark.slow
 def test_the_base_has_exact_torques_and_the_trunk_is_weighed() -> None:
-    *_, added = walking()
+    _, train, _, added = walking()
     fit = fitted()
     noise = fit.hyperparameters[TORQUE_NOISE].exp()
-    assert noise[:6].tolist() == pytest.approx([EXACT] * 6) and float(noise[6:].median()) > 100.0 * EXACT
+    assert noise[:6].tolist() == pytest.approx([EXACT] * 6)
+    # Beside the noise of accelerations, the log does not show that of each joint.
+    stated = legs.TORQUE * float(train.tau.abs().max())
+    assert 0.5 < float(noise[6:].square().mean().sqrt()) / stated < 2.0
     assert float(fit.hyperparameters[MEMORY][:6].exp().max()) < 1e-9
     found = {each.name: each for each in fit.parameters()}
     assert not any("base" in name for name in found if not name.startswith("inertial."))
