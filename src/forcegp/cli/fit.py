@@ -328,9 +328,8 @@ def _listed(parameters: Sequence[RobotParameter], short: Mapping[str, str]) -> t
     # Most parameters of single links and payloads are never determined.
     missing = [label(p) for p in parameters if not p.determined and not links]
     heading = f"{group} [{unit}] " if unit else f"{group} "
-    return heading * bool(texts) + _first(texts), ALL if missing and len(missing) == len(
-        parameters
-    ) else _first(missing)
+    rest = ALL if missing and len(missing) == len(parameters) else _first(missing)
+    return heading * bool(texts) + _first(texts), rest
 
 
 def _first(texts: Sequence[str]) -> str:
