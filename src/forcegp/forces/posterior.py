@@ -49,9 +49,9 @@ OUTERMOST, WIDEST = 0.01, 0.16
 tail of a Gaussian beyond one standard deviation. At least one independent sample lies beyond.
 """
 SLOWEST = 1e-3
-"""Least standard deviation of a joint's speed [rad/s, m/s], below the noise of computed velocities. With 0.02,
-±2σ holds for .01 to .31 of the torques of five joints that stood still in training (three simulated logs,
-`benchmarks/unusual_logs.py`), and for .17 to 1.00 with this value."""
+"""Least standard deviation of a joint's speed [rad/s, m/s], below the noise of computed velocities. ±2σ holds
+for .17 to 1.00 of the torques of five joints that stood still in training (three simulated logs,
+`benchmarks/unusual_logs.py`), and with 0.02 for .01 to .31."""
 UNLOADED = 1e-6
 """Least load of a joint, relative to the largest: a free base may have neither torque nor load."""
 RELATIVE = 0.05
